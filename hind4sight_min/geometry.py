@@ -1,0 +1,165 @@
+"""Pinhole camera, rigid motion, the transform layer (Eq. 1) and the projection layer.
+
+Frames: *arena* (z up, origin in the middle of the table surface) and *camera* (OpenCV: x right,
+y down, z forward). Units: metres, radians, pixels (a pixel's centre has integer coordinates).
+Everything here is differentiable by autograd; float32 in gives float32 out.
+"""
+from dataclasses import dataclass
+
+import autograd.numpy as np
+import numpy as onp
+
+from .ops import take
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fixed pinhole camera without lens distortion.
+
+    width, height: image size in pixels. fx, fy, cx, cy: intrinsics in pixels *of this image size*.
+    arena_from_camera: (4, 4) float64, the camera's pose: maps camera points to arena points.
+    Raises ValueError for sizes, intrinsics or a pose that no camera can have.
+    """
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    arena_from_camera: onp.ndarray
+
+    def __post_init__(self):
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera: expected a positive image size, got {self.width} x {self.height}")
+        intrinsics = onp.array([self.fx, self.fy, self.cx, self.cy], float)
+        if not onp.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
+            raise ValueError(f"camera: expected finite intrinsics with fx, fy > 0, got {intrinsics.tolist()}")
+        pose = onp.array(self.arena_from_camera, float)
+        if pose.shape != (4, 4):
+            raise ValueError(f"camera: arena_from_camera must be (4, 4), got {pose.shape}")
+        rotation = pose[:3, :3]
+        if not (onp.allclose(rotation @ rotation.T, onp.eye(3), atol=1e-5) and onp.linalg.det(rotation) > 0
+                and onp.isfinite(pose).all() and onp.allclose(pose[3], [0, 0, 0, 1])):
+            raise ValueError("camera: arena_from_camera is not a rigid transform (rotation and translation)")
+        object.__setattr__(self, "arena_from_camera", pose)
+
+    @property
+    def camera_from_arena(self):
+        """(4, 4) float64: maps arena points to camera points."""
+        return onp.linalg.inv(self.arena_from_camera)
+
+    @property
+    def is_mirror_symmetric(self):
+        """True when the image flipped left-right shows the arena mirrored at its plane x = 0."""
+        right, position = self.arena_from_camera[:3, 0], self.arena_from_camera[:3, 3]
+        return bool(onp.allclose(right, [1, 0, 0], atol=1e-6) and abs(position[0]) < 1e-6
+                    and abs(self.cx - (self.width - 1) / 2) < 1e-6)
+
+
+def look_at(eye, target):
+    """Camera pose (4, 4) arena_from_camera at `eye`, looking at `target` (both (3,), m, arena), z up.
+
+    Not in the paper: it only says that the camera is fixed.
+    """
+    eye, target = onp.asarray(eye, float), onp.asarray(target, float)
+    forward = (target - eye) / onp.linalg.norm(target - eye)
+    right = onp.cross(forward, [0.0, 0.0, 1.0])
+    right /= onp.linalg.norm(right)
+    pose = onp.eye(4)
+    pose[:3] = onp.stack([right, onp.cross(forward, right), forward, eye], axis=1)
+    return pose
+
+
+def rigid(points, transform):
+    """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points."""
+    matrix = transform.astype(points.dtype)
+    return np.dot(points, matrix[:3, :3].T) + matrix[:3, 3]
+
+
+def unproject(depth, camera):
+    """Depth picture to an organised point cloud in the arena frame: the inverse of `project`.
+
+    Paper: Sec. III-A, "raw point cloud P_t = (X_t, Y_t, Z_t)".
+    X = (u - cx) Z / fx,  Y = (v - cy) Z / fy, then arena_from_camera.
+    depth (..., H, W) m along the optical axis -> points (..., H, W, 3) m. Pixels without depth (0)
+    become points at the camera: carry `depth > 0` along as the validity mask.
+    """
+    if depth.shape[-2:] != (camera.height, camera.width):
+        raise ValueError(f"depth: expected (..., {camera.height}, {camera.width}) as the camera says, "
+                         f"got {depth.shape}")
+    u = (onp.arange(camera.width) - camera.cx) / camera.fx
+    v = (onp.arange(camera.height) - camera.cy) / camera.fy
+    dtype = depth.dtype
+    points_camera = np.stack([depth * u.astype(dtype), depth * v.astype(dtype)[:, None], depth], axis=-1)
+    return rigid(points_camera, camera.arena_from_camera)
+
+
+MIN_DEPTH = 0.05  # m; points nearer than this (or behind the camera) are projected as if at this depth
+
+
+def project(points_arena, camera):
+    """Points (..., 3) m, arena -> pixel positions (..., 2), (x right, y down).
+
+    x = fx X / Z + cx,  y = fy Y / Z + cy  in camera coordinates, with Z at least MIN_DEPTH, so that a
+    wild prediction gives a large finite pixel, never an infinite one.
+    """
+    points_camera = rigid(points_arena, camera.camera_from_arena)
+    z = np.maximum(take(points_camera, (..., slice(2, 3))), MIN_DEPTH)
+    focal = onp.array([camera.fx, camera.fy], points_arena.dtype)
+    centre = onp.array([camera.cx, camera.cy], points_arena.dtype)
+    return take(points_camera, (..., slice(0, 2))) / z * focal + centre
+
+
+def optical_flow(points, predicted, camera):
+    """The projection layer: scene flow to optical flow.
+
+    Paper: Sec. III-C.  U = x_{t+1} - x,  V = y_{t+1} - y.
+    points, predicted (..., 3) m, arena -> flow (..., 2) px, (U, V).
+    """
+    return project(predicted, camera) - project(points, camera)
+
+
+def so3_exp(rotation_vector):
+    """Rotation vectors (..., 3) rad -> rotation matrices (..., 3, 3): Rodrigues' formula.
+
+    R = I + a [w]x + b [w]x^2,  a = sin(t)/t,  b = 2 sin^2(t/2)/t^2,  t = |w|.
+    b in this form keeps its digits in float32, where (1 - cos t)/t^2 is 0 from t = 1e-4 down. Below
+    t = 1e-2 both are Taylor series, evaluated on a *safe* t, so that no NaN gradient leaks through
+    `where`. Paper: Sec. III-A, [R, T] in SE(3).
+    """
+    w = rotation_vector
+    square = np.sum(w * w, axis=-1)
+    small = square < 1e-4
+    safe = np.where(small, np.ones_like(square), square)
+    t = np.sqrt(safe)
+    half = np.sin(t / 2)  # products, not `**`: autograd's derivative of a power is float64
+    a = np.where(small, 1 - square / 6 + square * square / 120, np.sin(t) / t)
+    b = np.where(small, 0.5 - square / 24 + square * square / 720, 2 * half * half / safe)
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    cross = np.reshape(cross, w.shape[:-1] + (3, 3))
+    return (onp.eye(3, dtype=w.dtype) + a[..., None, None] * cross
+            + b[..., None, None] * np.matmul(cross, cross))
+
+
+def transform_layer(points, masks, rotations, translations):
+    """The transform layer: every point moved by the mask-weighted mean of K rigid motions.
+
+    Paper: Eq. (1), Sec. III-A.  P' = sum_k m_k (R_k P + T_k).
+    points (B, N, 3) m; masks (B, N, K), summing to 1 over K; rotations (B, K, 3, 3); translations (B, K, 3) m.
+    Returns the predicted points (B, N, 3) m. Raises ValueError for other shapes.
+
+    The K motions are blended first, one (3, 4) matrix per point, by one matrix product:
+    sum_k m_k (R_k P + T_k) = (sum_k m_k R_k) P + sum_k m_k T_k.
+    """
+    batch, count = points.shape[0], masks.shape[-1]
+    if points.ndim != 3 or masks.shape[:2] != points.shape[:2] or rotations.shape != (batch, count, 3, 3) \
+            or translations.shape != (batch, count, 3):
+        raise ValueError("transform_layer: expected points (B, N, 3), masks (B, N, K), rotations (B, K, 3, 3), "
+                         f"translations (B, K, 3), got {points.shape}, {masks.shape}, {rotations.shape}, "
+                         f"{translations.shape}")
+    motions = np.concatenate([np.reshape(rotations, (batch, count, 9)), translations], axis=2)
+    blended = np.matmul(masks, motions)  # (B, N, 12)
+    matrices = np.reshape(take(blended, (..., slice(0, 9))), points.shape + (3,))
+    return np.sum(matrices * points[..., None, :], axis=-1) + take(blended, (..., slice(9, 12)))  # Eq. (1)
