@@ -1,0 +1,144 @@
+"""Equations 2-6: one function per equation.
+
+Shapes: B interactions, H, W the picture, N = H * W points, row by row, so a map (B, N) is a picture (B, H, W).
+Every loss returns (B,): the sum over pixels as printed in the paper, per interaction; training averages
+over the batch. `valid` (B, N) marks pixels with depth: the others neither attract nor cost anything.
+"""
+import autograd.numpy as np
+import numpy as onp
+from autograd.tracer import getval
+
+from .ops import bilinear_sample, nearest_squared_distances, take
+
+EDGE_SHARPNESS = 10.0  # the paper's exp(-|grad I|) depends on the range of I; ours is [0, 1], so exp(-10 |grad I|)
+
+
+# --- 3D -----------------------------------------------------------------------------------------------
+
+def distance_maps(predicted, observed, valid_predicted, valid_observed):
+    """The two distance transforms between clouds, each on its own cloud's grid.
+
+    Paper: Sec. III-B.  D_{P'->P}(i) = min_j |P'_i - P_j|^2,  D_{P->P'}(j) = min_i |P'_i - P_j|^2.
+    predicted, observed (B, N, 3) m; valid_* (B, N) bool -> two maps (B, N) m^2, 0 where not valid.
+    The first lives on frame t's grid, the second on frame t+1's.
+    """
+    return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
+            nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
+
+
+def chamfer_loss(map_predicted, map_observed):
+    """Paper: Eq. (2), Sec. III-B.  L_CD = sum_xy (D_{P'->P} + D_{P->P'}).  Two maps (B, N) m^2 -> (B,) m^2."""
+    return np.sum(map_predicted + map_observed, axis=1)  # Eq. (2)
+
+
+# --- 2D -----------------------------------------------------------------------------------------------
+
+def warp_backward(next_images, flow):
+    """I'_t: frame t+1 pulled back to frame t along the flow, and which pixels stay in view.
+
+    Paper: Sec. III-C.  I'_t(x, y) = I_{t+1}(x + U, y + V), bilinear.
+    next_images (B, H, W, C), flow (B, H, W, 2) px -> warped (B, H, W, C), in_view (B, H, W) bool.
+    """
+    batch, height, width, _ = next_images.shape
+    v, u = onp.mgrid[:height, :width]
+    positions = onp.stack([u, v], axis=-1).astype(getval(flow).dtype) + flow
+    where = getval(positions)
+    in_view = ((where >= 0) & (where <= [width - 1, height - 1])).all(axis=-1)
+    warped = bilinear_sample(next_images, np.reshape(positions, (batch, -1, 2)))
+    return np.reshape(warped, next_images.shape), in_view
+
+
+def photometric_loss(images, next_images, flow, valid):
+    """Paper: Eq. (3), Sec. III-C.  L_rec = sum_xy |I_t - I'_t|_1.
+
+    images, next_images (B, H, W, C) in [0, 1]; flow (B, H, W, 2) px; valid (B, N) bool -> (B,).
+    Pixels that the flow carries out of view have nothing to be compared with and cost nothing.
+    """
+    warped, in_view = warp_backward(next_images, flow)
+    counted = onp.reshape(valid, in_view.shape) & in_view
+    return np.sum(np.abs(images - warped) * counted[..., None], axis=(1, 2, 3))  # Eq. (3)
+
+
+def edge_weights(images):
+    """exp(-EDGE_SHARPNESS |grad I|) between horizontal and between vertical neighbours.
+
+    images (B, H, W, C) in [0, 1] -> (B, H, W-1), (B, H-1, W); |grad I| is the mean over the channels.
+    """
+    across = onp.abs(onp.diff(images, axis=2)).mean(axis=-1)
+    down = onp.abs(onp.diff(images, axis=1)).mean(axis=-1)
+    return onp.exp(-EDGE_SHARPNESS * across), onp.exp(-EDGE_SHARPNESS * down)
+
+
+def edge_aware_smoothness(field, images):
+    """sum_xy |d field/dx| e^{-|dI/dx|} + |d field/dy| e^{-|dI/dy|}: the common form of Eq. (4) and (5).
+
+    field (B, H, W, C); images (B, H, W, 3) on the same grid, in [0, 1] -> (B,), units of the field.
+    """
+    across, down = edge_weights(images)
+    every, after, before = slice(None), slice(1, None), slice(None, -1)
+    dx = np.abs(take(field, (every, every, after)) - take(field, (every, every, before)))
+    dy = np.abs(take(field, (every, after)) - take(field, (every, before)))
+    return np.sum(dx * across[..., None], axis=(1, 2, 3)) + np.sum(dy * down[..., None], axis=(1, 2, 3))
+
+
+def flow_smoothness_loss(flow, images):
+    """Paper: Eq. (4), Sec. III-D.  L_fs = sum |grad U| e^{-|grad I_t|} + |grad V| e^{-|grad I_t|}.
+
+    flow (B, H, W, 2) px; images (B, H, W, 3) -> (B,) px.
+    """
+    return edge_aware_smoothness(flow, images)  # Eq. (4)
+
+
+def distance_smoothness_loss(map_predicted, map_observed, images, next_images):
+    """Paper: Eq. (5), Sec. III-D.  L_ds = sum |grad D_{P->P'}| e^{-|grad I|} + |grad D_{P'->P}| e^{-|grad I|}.
+
+    The paper prints I_{t+1} for both; D_{P'->P} lives on frame t's grid, so it is weighted by I_t here.
+    Two maps (B, N) m^2, two images (B, H, W, 3) -> (B,) m^2.
+    """
+    grid = images.shape[:3] + (1,)
+    return (edge_aware_smoothness(np.reshape(map_observed, grid), next_images)
+            + edge_aware_smoothness(np.reshape(map_predicted, grid), images))  # Eq. (5)
+
+
+# --- the inverse model -----------------------------------------------------------------------------------
+
+def heatmap_cross_entropy(logits, cells):
+    """Cross entropy of a heat-map over the arena's cells. Paper: L_act, Sec. III-E.
+
+    -log softmax(logits)[cell].  logits (B, cells), cells (B,) int -> (B,) nats.
+    """
+    top = onp.max(getval(logits), axis=1)  # cancels; keeps exp in range
+    total = np.sum(np.exp(logits - top[:, None]), axis=1)
+    return top + np.log(total) - logits[onp.arange(len(cells)), cells]
+
+
+def embedding_loss(predicted, observed):
+    """L1 distance of the predicted and the observed next state's embedding. Paper: L_sim, Sec. III-E.
+
+    (B, E), (B, E) -> (B,), the mean over E, so that its weight does not depend on the embedding's width.
+    """
+    return np.mean(np.abs(predicted - observed), axis=1)
+
+
+def inverse_loss(start_logits, end_logits, start_cells, end_cells, predicted_embedding, next_embedding):
+    """Paper: Sec. III-E.  L_inv = L_act + L_sim, with L_act over both heat-maps -> (B,)."""
+    return (heatmap_cross_entropy(start_logits, start_cells) + heatmap_cross_entropy(end_logits, end_cells)
+            + embedding_loss(predicted_embedding, next_embedding))
+
+
+# --- the full model ----------------------------------------------------------------------------------------
+
+# Weights of L_CD, L_ds, L_rec, L_fs, L_inv. The paper's own belong to its sums over its picture size.
+PAPER_WEIGHTS = {"chamfer": 1e5, "distance_smoothness": 1e5, "photometric": 1e3, "flow_smoothness": 1e3,
+                 "inverse": 1.0}
+
+
+def full_loss(terms, weights):
+    """Paper: Eq. (6), Sec. III-F.  L = lambda_1 L_3D + lambda_2 L_2D + lambda_3 L_inv, averaged over the batch.
+
+    L_3D = L_CD + L_ds and L_2D = L_rec + L_fs; with a weight per term, so that an ablation is a zero.
+    terms: dict of (B,); weights: dict of floats; both with the keys of PAPER_WEIGHTS -> scalar.
+    """
+    if set(terms) != set(weights):
+        raise ValueError(f"weights: expected the keys {sorted(terms)}, got {sorted(weights)}")
+    return np.mean(sum(weights[name] * terms[name] for name in terms))  # Eq. (6)
