@@ -1,0 +1,140 @@
+"""Metrics, with the unit in the name, beside the no-motion baseline and chance. Paper: Sec. IV-C to IV-F.
+
+This file reads the simulator's truth; training does not.
+"""
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from .geometry import optical_flow
+from .interactions import cell_centres, true_scene_flow
+from .networks import encode, forward_model, inverse_model, predicted_flow
+from .ops import softmax
+from .training import make_batch
+
+MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
+
+
+def predict(run, interactions, rows):
+    """The whole model on some rows -> (Batch, Prediction, optical flow, start heat-maps, end heat-maps)."""
+    batch = make_batch(interactions, rows)
+    encoding = encode(run.params, batch.points, batch.valid)
+    next_features, _ = encode(run.params, batch.next_points, batch.next_valid)
+    prediction = forward_model(run.params, run.recipe.sizes, batch.points, batch.valid, batch.pokes, encoding)
+    flow = predicted_flow(prediction, batch.points, interactions.camera)
+    heatmaps = inverse_model(run.params, batch.points, batch.next_points, batch.valid & batch.next_valid,
+                             encoding[0], next_features, batch.cells)
+    return (batch, prediction, flow, *map(softmax, heatmaps))
+
+
+def poke_from_heatmaps(start_heatmaps, end_heatmaps, settings):
+    """Heat-maps (B, cells) -> pokes (B, 3): the target is the end map's best cell, the direction points there
+    from the start map's mean position, seen from the target. Paper: Sec. III-E.
+
+    A best cell alone would give the direction in steps; the mean over the map of the *unit vectors* to the
+    target is finer and does not mind a wide map.
+    """
+    centres = cell_centres(settings)
+    target = centres[np.argmax(end_heatmaps, axis=1)]
+    offsets = target[:, None] - centres  # (B, cells, 2)
+    length = np.linalg.norm(offsets, axis=2, keepdims=True)
+    units = offsets / np.maximum(length, 1e-9)
+    mean = np.sum(start_heatmaps[..., None] * units, axis=1)
+    return np.column_stack([target, np.arctan2(mean[:, 1], mean[:, 0])])
+
+
+def matched_iou(masks, labels, moved):
+    """IoU of each moved object with the predicted mask that the best one-to-one matching gives it.
+
+    masks (N, K) soft, 0 = background; labels (N,) int; moved: the labels of the moved objects -> (len(moved),).
+    A pixel belongs to its largest mask. An object without a mask scores 0.
+    """
+    hard = np.argmax(masks, axis=1)
+    iou = np.zeros((len(moved), masks.shape[1] - 1))
+    for i, label in enumerate(moved):
+        for k in range(1, masks.shape[1]):
+            union = np.count_nonzero((labels == label) | (hard == k))
+            iou[i, k - 1] = np.count_nonzero((labels == label) & (hard == k)) / max(union, 1)
+    rows, columns = linear_sum_assignment(-iou)
+    result = np.zeros(len(moved))
+    result[rows] = iou[rows, columns]
+    return result
+
+
+def evaluate(run, interactions, truth, progress=None):
+    """All metrics on a data set -> flat dict of floats.
+
+    flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
+    an interaction in which nothing moved has no moving point and so no say in it (it still counts for
+    still_epe_cm). flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for
+    predicting no motion. still_epe_cm: mean drift of points that do not move; all_epe_cm: of all points.
+    mask_iou: mean over the objects that moved. optical_epe_px: over moving points in view; optical_epe_all_px:
+    over all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a poke drawn from the
+    set at random. Raises ValueError where nothing moved at all.
+    """
+    settings, camera = interactions.meta["settings"], interactions.camera
+    sums = dict.fromkeys(("moving", "still", "squared", "motion", "error", "length", "drift", "optical",
+                          "optical_zero", "optical_all", "optical_zero_all"), 0.0)
+    ious, pokes, moved_rows = [], [], []
+    for first in range(0, len(interactions), 8):
+        rows = np.arange(first, min(first + 8, len(interactions)))
+        batch, prediction, flow, start_heatmaps, end_heatmaps = predict(run, interactions, rows)
+        pokes.append(poke_from_heatmaps(start_heatmaps, end_heatmaps, settings))
+        for i, row in enumerate(rows):
+            points, labels = batch.points[i], truth.labels[row].ravel()
+            true = true_scene_flow(points, labels, truth.poses_before[row], truth.poses_after[row])
+            length = np.linalg.norm(true, axis=1)
+            moving = (length > MOVING) & batch.valid[i]
+            still = batch.valid[i] & ~moving
+            error = np.linalg.norm(prediction.points[i] - points - true, axis=1)
+            true_pixels = optical_flow(points, points + true, camera)
+            pixel_error = np.linalg.norm(flow[i].reshape(-1, 2) - true_pixels, axis=1)
+            pixel_length = np.linalg.norm(true_pixels, axis=1)
+            for name, value in (("moving", moving.sum()), ("still", still.sum()),
+                                ("squared", (error[moving] ** 2).sum()), ("motion", (length[moving] ** 2).sum()),
+                                ("error", error[moving].sum()), ("length", length[moving].sum()),
+                                ("drift", error[still].sum()), ("optical", pixel_error[moving].sum()),
+                                ("optical_zero", pixel_length[moving].sum()),
+                                ("optical_all", pixel_error[batch.valid[i]].sum()),
+                                ("optical_zero_all", pixel_length[batch.valid[i]].sum())):
+                sums[name] += float(value)
+            moved = [label for label in np.unique(labels[moving]) if label > 0]
+            if moved:
+                moved_rows.append(row)
+                ious.extend(matched_iou(prediction.masks[i], labels, moved))
+        if progress:
+            progress(int(rows[-1]) + 1, len(interactions))
+    if not sums["moving"]:
+        raise ValueError("interactions: nothing moved in any of them, so there is nothing to measure")
+    moving, everything = sums["moving"], sums["moving"] + sums["still"]
+    found = np.concatenate(pokes)[moved_rows]
+    true_pokes = interactions.pokes[moved_rows]
+    shuffled = true_pokes[np.random.default_rng(0).permutation(len(true_pokes))]
+    result = {
+        "flow_mse_ratio": sums["squared"] / sums["motion"],
+        "flow_mse_cm2": 1e4 * sums["squared"] / moving,
+        "flow_rmse_cm": 100 * np.sqrt(sums["squared"] / moving),
+        "flow_epe_cm": 100 * sums["error"] / moving,
+        "still_epe_cm": 100 * sums["drift"] / max(sums["still"], 1),
+        "all_epe_cm": 100 * (sums["error"] + sums["drift"]) / everything,
+        "no_motion_mse_cm2": 1e4 * sums["motion"] / moving,
+        "no_motion_rmse_cm": 100 * np.sqrt(sums["motion"] / moving),
+        "no_motion_epe_cm": 100 * sums["length"] / moving,
+        "mask_iou": np.mean(ious),
+        "optical_epe_px": sums["optical"] / moving,
+        "no_motion_optical_epe_px": sums["optical_zero"] / moving,
+        "optical_epe_all_px": sums["optical_all"] / everything,
+        "no_motion_optical_epe_all_px": sums["optical_zero_all"] / everything,
+    }
+    for suffix, guess in (("", found), ("_chance", shuffled)):
+        target, direction = poke_errors(guess, true_pokes)
+        result[f"inverse_target{suffix}_cm"] = 100 * np.median(target)
+        result[f"inverse_direction{suffix}_deg"] = np.degrees(np.median(direction))
+    result["pokes"], result["pokes_moved"] = len(interactions), len(moved_rows)
+    return {name: float(value) for name, value in result.items()}
+
+
+def poke_errors(pokes, true_pokes):
+    """(distance of the targets in m, angle between the directions in rad, in [0, pi]), each (M,)."""
+    turn = pokes[:, 2] - true_pokes[:, 2]
+    return (np.linalg.norm(pokes[:, :2] - true_pokes[:, :2], axis=1),
+            np.abs((turn + np.pi) % (2 * np.pi) - np.pi))

@@ -1,0 +1,261 @@
+"""The siamese point encoder, the forward model and the inverse model. Parameters are a dict of arrays.
+
+Every network is the same small perceptron applied to each point, plus *context*: pooled features of the
+whole cloud, handed back to every point. Paper: Sec. III-A, III-E and Fig. 3.
+"""
+from dataclasses import dataclass
+
+import autograd.numpy as np
+import numpy as onp
+from autograd.tracer import getval
+
+from .geometry import optical_flow, so3_exp, transform_layer
+from .ops import dense_relu, max_pool, softmax, take
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """masks: K, background included. width: units of the forward model. rounds: of context.
+    embedding: length of the state embedding s_t and of the encoder's features.
+    """
+    masks: int = 4
+    width: int = 64
+    rounds: int = 2
+    embedding: int = 64
+
+    def __post_init__(self):
+        for name, least in (("masks", 2), ("width", 1), ("rounds", 1), ("embedding", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+
+
+@dataclass
+class Prediction:
+    """What the forward model says of B interactions. N points, K masks (0 is the background)."""
+    points: object        # (B, N, 3) m, arena: P'_{t+1}
+    masks: object         # (B, N, K), summing to 1 over K
+    rotations: object     # (B, K, 3, 3)
+    translations: object  # (B, K, 3) m
+    embedding: object     # (B, E): s'_{t+1}
+
+
+# --- inputs (fixed functions of the observation and the poke: nothing to differentiate) -----------------
+
+def fourier(values, wavelengths):
+    """sin and cos of 2 pi v / w: positions as a perceptron can use them. (..., D) -> (..., 2 D len(wavelengths))."""
+    phase = values[..., None] * (2 * onp.pi / onp.asarray(wavelengths)).astype(values.dtype)
+    phase = phase.reshape(values.shape[:-1] + (-1,))
+    return onp.concatenate([onp.sin(phase), onp.cos(phase)], axis=-1)
+
+
+def encoder_features(points):
+    """Arena coordinates of each point, (..., 3) m -> (..., 19)."""
+    return onp.concatenate([points / 0.25, fourier(points[..., :2], (0.8, 0.4, 0.2, 0.1))], axis=-1)
+
+
+def poke_axes(pokes):
+    """Pokes (B, 3) -> Q (B, 3, 3), o (B, 3): p_arena = Q p_poke + o, x along the poke, origin at its target."""
+    c, s, zero, one = onp.cos(pokes[:, 2]), onp.sin(pokes[:, 2]), 0 * pokes[:, 2], 0 * pokes[:, 2] + 1
+    axes = onp.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+    return axes, onp.stack([pokes[:, 0], pokes[:, 1], zero], axis=-1)
+
+
+def poke_frame(points, pokes):
+    """Points (B, N, 3) m, arena -> the same in each poke's frame."""
+    axes, origins = poke_axes(pokes.astype(points.dtype))
+    return onp.matmul(points - origins[:, None], axes)
+
+
+def poke_features(local):
+    """Poke-frame coordinates, (..., 3) m -> (..., 19)."""
+    return onp.concatenate([local / 0.1, fourier(local[..., :2], (0.4, 0.2, 0.1, 0.05))], axis=-1)
+
+
+def pooling_weights(local, valid):
+    """Where the context looks: (B, 2, N), rows sum to 1. Around the target, and along the finger's path.
+
+    Points on the table's surface are left out: they say nothing about the objects there.
+    """
+    x, y, z = local[..., 0], local[..., 1], local[..., 2]
+    near = onp.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
+    path = onp.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.18) & (x < 0.02))
+    weights = onp.stack([near, path], axis=1) * (valid & (z > 0.005))[:, None]
+    return weights / (weights.sum(axis=2, keepdims=True) + 1e-6)
+
+
+# --- parameters --------------------------------------------------------------------------------------------
+
+def init_parameters(sizes, rng, dtype=onp.float32):
+    """Random parameters: He initialisation; identity motions; mask 0 taken by the background.
+
+    Paper: Sec. III-G, "initializing one out of K masks to predict all pixels as background and moreover
+    initializing SE(3) transformations to predict identity transform".
+    """
+    params, width, embedding = {}, sizes.width, sizes.embedding
+
+    def layer(name, inputs, outputs, gain=2.0):
+        params[name + "_w"] = (rng.standard_normal((inputs, outputs)) * onp.sqrt(gain / inputs)).astype(dtype)
+        params[name + "_b"] = onp.zeros(outputs, dtype)
+
+    layer("encoder_1", 19, embedding)
+    layer("encoder_2", embedding, embedding)
+    layer("trunk_0", 19 + embedding, width)
+    for i in range(1, sizes.rounds + 1):
+        layer(f"trunk_{i}", width, width)
+        layer(f"context_{i}", 3 * width, width, gain=1.0)  # its bias is the trunk layer's
+        del params[f"trunk_{i}_b"]
+    layer("mask", width, sizes.masks - 1, gain=0.1)
+    params["mask_b"] -= 1  # background first
+    layer("motion_1", 4 * width + 3, width)
+    layer("motion_2", width, 6, gain=0.0)
+    layer("next_1", embedding + 3 * width, width)
+    layer("next_2", width, embedding, gain=0.0)
+    layer("change", 2 * 19 + 2 * embedding, width)
+    layer("cell_1", 18, width)
+    layer("cell_context", width, width, gain=1.0)  # its bias is the next layer's
+    layer("cell_2", width, width)
+    del params["cell_2_b"]
+    layer("heatmaps", width, 2, gain=0.1)
+    return params
+
+
+# --- the three networks --------------------------------------------------------------------------------------
+
+def dense(params, name, x):
+    """x W + b, for a few rows.  (..., I) -> (..., O)."""
+    return np.dot(x, params[name + "_w"]) + params[name + "_b"]
+
+
+def relu(x):
+    """max(x, 0) for a few rows, as a product: autograd's derivative of np.maximum is slow."""
+    return x * (getval(x) > 0)
+
+
+def encode(params, points, valid):
+    """The siamese encoder: per-point features and the scene's state embedding s. Paper: Sec. III-E, III-G.
+
+    points (B, N, 3) m arena, valid (B, N) bool -> features (B, N, E), embedding (B, E), their mean over valid
+    points.
+    """
+    x = dense_relu(encoder_features(points), params["encoder_1_w"], params["encoder_1_b"])
+    x = dense_relu(x, params["encoder_2_w"], params["encoder_2_b"])
+    mean = valid / onp.maximum(valid.sum(axis=1, keepdims=True), 1).astype(points.dtype)
+    return x, np.matmul(mean[:, None], x)[:, 0]
+
+
+MASK_BOUND = 6.0  # so a mask lies between exp(-6) / (1 + exp(-6)) and the like of 1 - exp(-6)
+
+# A poke changes some 3 % of the points, so s_{t+1} - s_t is small beside s_t.
+CHANGE_GAIN = 30.0
+
+
+def forward_model(params, sizes, points, valid, pokes, encoding=None):
+    """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
+
+    points (B, N, 3) m arena; valid (B, N) bool; pokes (B, 3), (m, m, rad); encoding: `encode(params, points,
+    valid)` if already at hand -> Prediction.
+    """
+    features, state = encoding or encode(params, points, valid)
+    local = poke_frame(points, pokes)
+    pooling = pooling_weights(local, valid)
+
+    def context(h):  # (B, N, C) -> (B, 3 C)
+        pooled = np.reshape(np.matmul(pooling, h), (len(points), -1))
+        return np.concatenate([max_pool(h, valid), pooled], axis=1)
+
+    h = np.concatenate([poke_features(local), features], axis=2)
+    h = dense_relu(h, params["trunk_0_w"], params["trunk_0_b"])
+    for i in range(1, sizes.rounds + 1):
+        h = h + dense_relu(h, params[f"trunk_{i}_w"], dense(params, f"context_{i}", context(h)))
+    seen = context(h)
+
+    # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (Adam
+    # overshoots) would have no gradient left to come back with.
+    movers = MASK_BOUND * np.tanh(dense(params, "mask", h) / MASK_BOUND)
+    masks = softmax(np.concatenate([onp.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, N, K)
+    rotations, translations = _motions(params, h, masks, seen, local, valid, pokes)
+    predicted = transform_layer(points, masks, rotations, translations)  # Eq. (1)
+
+    change = relu(dense(params, "next_1", np.concatenate([state, seen], axis=1)))
+    return Prediction(predicted, masks, rotations, translations, state + dense(params, "next_2", change) / CHANGE_GAIN)
+
+
+def _motions(params, h, masks, seen, local, valid, pokes):
+    """One rigid motion per mask, from the features pooled under it; the background's is the identity.
+
+    The network speaks in the poke frame, of a turn about the mask's centroid c and a shift t:
+    p' = R (p - c) + c + t, that is T = c - R c + t, then turned into the arena frame.
+    """
+    moving = take(masks, (..., slice(1, None))) * valid[..., None]
+    share = np.swapaxes(moving / (np.sum(moving, axis=1, keepdims=True) + 1e-3), 1, 2)  # (B, K-1, N), sum to 1
+    pooled, centroids = np.matmul(share, h), np.matmul(share, local)  # (B, K-1, C), (B, K-1, 3)
+    batch, count = pooled.shape[:2]
+    everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
+    x = relu(dense(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2)))
+    twist = dense(params, "motion_2", x)  # (B, K-1, 6): [translation, rotation]
+    turn = so3_exp(twist[..., 3:])
+    shift = centroids - _rotate(turn, centroids) + 0.05 * twist[..., :3]
+
+    # From the poke frame to the arena: with p_arena = Q p_poke + o, R -> Q R Q^T and T -> Q T + o - (Q R Q^T) o.
+    axes, origins = (value[:, None] for value in poke_axes(pokes.astype(local.dtype)))
+    rotations = np.matmul(np.matmul(axes, turn), onp.swapaxes(axes, 2, 3))
+    translations = _rotate(axes, shift) + origins - _rotate(rotations, origins)
+    identity = onp.broadcast_to(onp.eye(3, dtype=local.dtype), (batch, 1, 3, 3))
+    return (np.concatenate([identity, rotations], axis=1),
+            np.concatenate([onp.zeros((batch, 1, 3), local.dtype), translations], axis=1))
+
+
+def _rotate(matrices, vectors):
+    """R v.  (..., 3, 3), (..., 3) -> (..., 3)."""
+    return np.sum(matrices * vectors[..., None, :], axis=-1)
+
+
+CHANGED_POINTS = 128  # the inverse model looks at those that changed most: a poke changes about a hundred
+
+
+def most_changed(points, next_points, valid):
+    """Where the two clouds differ, pixel by pixel: the evidence of a poke.
+
+    points, next_points (B, N, 3) m; valid (B, N) bool, depth in both -> rows (B, M) int of the M most changed
+    points, and their weights (B, M), summing to 1. The weight is |P_{t+1} - P_t|^4: the power keeps the many
+    small differences of a noisy depth picture from outvoting the few large ones.
+    """
+    change = onp.sum((next_points - points) ** 2, axis=2) ** 2 * valid
+    count = min(CHANGED_POINTS, change.shape[1])
+    rows = onp.argpartition(-change, count - 1, axis=1)[:, :count]
+    weights = onp.take_along_axis(change, rows, axis=1)
+    return rows, weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
+
+
+def inverse_model(params, points, next_points, valid, features, next_features, cells):
+    """G: the poke that led from one cloud to the next, as two heat-maps. Paper: Sec. III-E.
+
+    points, next_points (B, N, 3) m arena; valid (B, N) bool, depth in both; features, next_features (B, N, E)
+    of the siamese encoder; cells (cells, 2) m, the centres of the arena's grid
+    -> start logits, end logits, each (B, cells); softmax makes them heat-maps.
+
+    Everything is said relative to the centre of change, so that a poke learnt in one corner of the arena is
+    known in all of them.
+    """
+    rows, weights = most_changed(points, next_points, valid)
+    pick = (onp.arange(len(points))[:, None], rows)
+    before, after = points[pick], next_points[pick]  # (B, M, 3)
+    centre = onp.sum(weights[..., None] * (before + after), axis=1) / 2
+    centre[:, 2] = 0
+    x = np.concatenate([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
+                        take(features, pick), take(next_features, pick)], axis=2)
+    x = dense_relu(x, params["change_w"], params["change_b"])
+    context = np.matmul(weights[:, None], x)[:, 0]  # (B, C): what changed, seen from its centre
+
+    local = (cells - centre[:, None, :2]).astype(points.dtype)  # (B, cells, 2)
+    y = onp.concatenate([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], axis=2)
+    y = dense_relu(y, params["cell_1_w"], params["cell_1_b"])
+    y = dense_relu(y, params["cell_2_w"], dense(params, "cell_context", context))
+    logits = dense(params, "heatmaps", y)
+    return take(logits, (..., 0)), take(logits, (..., 1))
+
+
+def predicted_flow(prediction, points, camera):
+    """The optical flow of a prediction, (B, H, W, 2) px: the projection layer. Paper: Sec. III-C."""
+    flow = optical_flow(points, prediction.points, camera)
+    return np.reshape(flow, (len(points), camera.height, camera.width, 2))
