@@ -19,9 +19,9 @@ class Sizes:
     embedding: length of the state embedding s_t and of the encoder's features.
     """
     masks: int = 4
-    width: int = 64
+    width: int = 48
     rounds: int = 2
-    embedding: int = 64
+    embedding: int = 32
 
     def __post_init__(self):
         for name, least in (("masks", 2), ("width", 1), ("rounds", 1), ("embedding", 1)):

@@ -107,7 +107,7 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 
 # From an audit of the terms between no motion and the true motion: 3D falls by 0.04 m^2, the photometric
 # term by 16, while flow smoothness rises by 45 px; see docs/research-log.md.
-WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 0.5, "flow_smoothness": 0.05, "inverse": 1.0}
+WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 0.1, "flow_smoothness": 0.003, "inverse": 1.0}
 
 
 @dataclass(frozen=True)
@@ -241,8 +241,6 @@ def train(interactions, run, threads=2, on_epoch=None, on_step=None):
             for terms, _ in parts:
                 for name, value in terms.items():
                     run.sums[name] = run.sums.get(name, 0.0) + value
-            if on_step:
-                on_step(run)
             if run.step % per_epoch == 0 or run.step == recipe.steps:
                 first = run.log[-1]["step"] if run.log else 0
                 run.log.append({"epoch": len(run.log) + 1, "step": run.step, "learning_rate": rate,
@@ -250,6 +248,8 @@ def train(interactions, run, threads=2, on_epoch=None, on_step=None):
                 run.sums = {}
                 if on_epoch:
                     on_epoch(run)
+            if on_step:  # after the log entry: what is saved here must not lack it
+                on_step(run)
     return run
 
 

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_training import SETTINGS, TINY, pokes_seen
+
+from hind4sight_min import evaluation
+from hind4sight_min.interactions import Truth, cell_centres, cells_of
+from hind4sight_min.networks import Prediction
+from hind4sight_min.training import make_batch, start_run
+
+
+def shifted_block(data, shift):
+    """A truth in which a 3 x 4 block of pixels of every picture moves by `shift`, and another block stays."""
+    count = len(data)
+    labels = np.zeros((count, 12, 16), np.uint8)
+    labels[:, 3:6, 4:8], labels[:, 8:10, 10:13] = 1, 2
+    before = np.zeros((count, 7, 7), np.float32)
+    before[..., 6] = 1
+    after = before.copy()
+    after[:, 0, :3] += shift
+    return Truth(labels, before, after)
+
+
+def oracle(monkeypatch, data, truth, share, drift=0.0):
+    """Make `predict` return `share` of the true motion, `drift` (m) on still points, and perfect heat-maps."""
+    def predict(run, interactions, rows):
+        batch = make_batch(interactions, rows)
+        moves = np.zeros_like(batch.points) + np.float32(drift) * np.array([1, 0, 0], np.float32)
+        masks = np.zeros(batch.points.shape[:2] + (3,))
+        masks[..., 0] = 0.5
+        for i, row in enumerate(rows):
+            labels = truth.labels[row].ravel()
+            moves[i, labels == 1] = share * (truth.poses_after[row, 0, :3] - truth.poses_before[row, 0, :3])
+            masks[i, labels == 1, 2] = 0.9  # mask 2 lies on object 1
+        points = batch.points + moves
+        flow = evaluation.optical_flow(batch.points, points, interactions.camera).reshape(len(rows), 12, 16, 2)
+        end, start = np.zeros((2, len(rows), 400))
+        end[np.arange(len(rows)), batch.end_cells] = 1
+        start[np.arange(len(rows)), batch.start_cells] = 1
+        return batch, Prediction(points, masks, None, None, None), flow, start, end
+    monkeypatch.setattr(evaluation, "predict", predict)
+
+
+def metrics(monkeypatch, share, drift=0.0, shift=(0.03, 0.04, 0.0)):
+    data = pokes_seen()
+    truth = shifted_block(data, shift)
+    oracle(monkeypatch, data, truth, share, drift)
+    return evaluation.evaluate(start_run(TINY, data), data, truth)
+
+
+def test_the_true_flow_scores_zero(monkeypatch):
+    found = metrics(monkeypatch, share=1.0)
+    for name in ("flow_mse_ratio", "flow_epe_cm", "still_epe_cm", "all_epe_cm", "optical_epe_px", "optical_epe_all_px"):
+        assert found[name] == pytest.approx(0, abs=1e-4), name
+    assert found["mask_iou"] == 1.0
+
+
+def test_half_the_true_flow_against_hand_values(monkeypatch):
+    found = metrics(monkeypatch, share=0.5, drift=0.002)  # the block moves by exactly 5 cm
+    expected = {"flow_mse_ratio": 0.25, "flow_mse_cm2": 6.25, "flow_rmse_cm": 2.5, "flow_epe_cm": 2.5,
+                "no_motion_mse_cm2": 25.0, "no_motion_rmse_cm": 5.0, "no_motion_epe_cm": 5.0, "still_epe_cm": 0.2,
+                "all_epe_cm": (12 * 2.5 + 180 * 0.2) / 192, "pokes": 7, "pokes_moved": 7}
+    for name, value in expected.items():
+        assert found[name] == pytest.approx(value, rel=1e-4), name
+    assert 0.4 * found["no_motion_optical_epe_px"] < found["optical_epe_px"] < 0.6 * found["no_motion_optical_epe_px"]
+
+
+def test_no_motion_is_its_own_baseline(monkeypatch):
+    found = metrics(monkeypatch, share=0.0)
+    assert found["flow_mse_ratio"] == pytest.approx(1)
+    assert found["flow_epe_cm"] == pytest.approx(found["no_motion_epe_cm"])
+    assert found["optical_epe_px"] == pytest.approx(found["no_motion_optical_epe_px"]) and found["optical_epe_px"] > 0.5
+
+
+def test_an_interaction_without_motion_has_no_say_in_the_moving_metrics(monkeypatch):
+    data = pokes_seen()
+    truth = shifted_block(data, (0.03, 0.04, 0.0))
+    truth.poses_after[3:] = truth.poses_before[3:]
+    oracle(monkeypatch, data, truth, 0.5)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    assert found["flow_mse_ratio"] == pytest.approx(0.25) and found["pokes_moved"] == 3
+    truth.poses_after[:] = truth.poses_before
+    with pytest.raises(ValueError, match="nothing moved"):
+        evaluation.evaluate(start_run(TINY, data), data, truth)
+
+
+def test_missing_depth_is_not_scored(monkeypatch):
+    data = pokes_seen()
+    truth = shifted_block(data, (0.03, 0.04, 0.0))
+    data.depth_before[:, 3:6, 4:6] = 0  # half of the moving block
+    oracle(monkeypatch, data, truth, 0.5)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    assert found["flow_mse_ratio"] == pytest.approx(0.25, rel=1e-4)
+    assert found["all_epe_cm"] == pytest.approx(6 * 2.5 / 186, rel=1e-4)
+
+
+def test_metrics_of_a_real_model_are_finite():
+    data = pokes_seen()
+    found = evaluation.evaluate(start_run(TINY, data), data, shifted_block(data, (0.03, 0, 0)))
+    assert np.isfinite(list(found.values())).all()
+    assert found["flow_mse_ratio"] == pytest.approx(1, abs=1e-3)  # untrained: no motion
+
+
+def test_matched_iou_is_blind_to_the_order_of_masks():
+    labels = np.repeat([0, 1, 2, 3], 10)
+    masks = np.eye(4)[np.repeat([0, 3, 1, 2], 10)]  # every object has a mask of its own, in another order
+    np.testing.assert_array_equal(evaluation.matched_iou(masks, labels, [1, 2, 3]), [1, 1, 1])
+    masks[15:20] = [1, 0, 0, 0]  # half of object 1 given to the background
+    masks[0:5] = [0, 0, 1, 0]    # object 3's mask spills over
+    found = evaluation.matched_iou(masks, labels, [1, 2, 3])
+    np.testing.assert_allclose(found, [0.5, 1, 10 / 15])
+
+
+def test_one_mask_over_two_objects_counts_once():
+    labels = np.repeat([0, 1, 2], 10)
+    masks = np.eye(2)[np.repeat([0, 1, 1], 10)]
+    found = evaluation.matched_iou(masks, labels, [1, 2])
+    np.testing.assert_allclose(np.sort(found), [0, 0.5])
+
+
+def test_poke_from_heatmaps_against_the_poke_that_made_them():
+    centres = cell_centres(SETTINGS)
+    target, start = np.array([[0.0125, -0.0375]]), np.array([[-0.0875, 0.0625]])
+    end_map, start_map = np.zeros((2, 1, 400))
+    end_map[0, cells_of(target, SETTINGS)], start_map[0, cells_of(start, SETTINGS)] = 1, 1
+    found = evaluation.poke_from_heatmaps(start_map, end_map, SETTINGS)
+    np.testing.assert_allclose(found[0], [0.0125, -0.0375, -np.pi / 4], atol=1e-9)
+    # A start map spread evenly to both sides of the line gives the same direction.
+    offsets = centres - target
+    across = np.abs(np.arctan2(*(offsets @ np.array([[1, 1], [-1, 1]])).T[::-1]))
+    spread = ((np.linalg.norm(offsets, axis=1) > 0.1) & (across > 2.5)).astype(float)[None]
+    direction = evaluation.poke_from_heatmaps(spread / spread.sum(), end_map, SETTINGS)[0, 2]
+    assert abs(direction + np.pi / 4) < np.radians(12)
+
+
+def test_poke_errors_are_circular():
+    a = np.array([[0, 0, 3.1], [0.03, 0.04, 0.0]])
+    b = np.array([[0, 0, -3.1], [0, 0, np.pi]])
+    distance, angle = evaluation.poke_errors(a, b)
+    np.testing.assert_allclose(distance, [0, 0.05])
+    np.testing.assert_allclose(angle, [2 * np.pi - 6.2, np.pi])
+
+
+def test_turned_object_is_scored_point_by_point(monkeypatch):
+    # A pure rotation: the centre hardly moves, the rim does. No motion must cost what the rim moves.
+    data = pokes_seen()
+    truth = shifted_block(data, (0, 0, 0))
+    points = make_batch(data, np.array([0])).points[0][(truth.labels[0] == 1).ravel()]
+    centre = points.mean(axis=0)
+    truth.poses_before[:, 0, :3] = truth.poses_after[:, 0, :3] = centre
+    turn = Rotation.from_rotvec([0, 0, 0.5])
+    truth.poses_after[:, 0, 3:] = turn.as_quat()
+    found = evaluation.evaluate(start_run(TINY, data[slice(0, 1)]), data[slice(0, 1)], truth[slice(0, 1)])
+    motion = turn.apply(points - centre) + centre - points
+    lengths = np.linalg.norm(motion, axis=1)
+    assert found["no_motion_rmse_cm"] == pytest.approx(100 * np.sqrt((lengths[lengths > 1e-3] ** 2).mean()), rel=1e-3)

@@ -1,0 +1,193 @@
+import numpy as np
+import pytest
+from autograd import grad
+
+from hind4sight_min import networks
+from hind4sight_min.networks import (Sizes, encode, forward_model, fourier, init_parameters, inverse_model,
+                                     most_changed, poke_axes, poke_frame, pooling_weights)
+
+SIZES = Sizes(masks=3, width=8, rounds=2, embedding=6)
+
+
+def scene(rng, batch=2, count=40, dtype=np.float64):
+    points = rng.uniform(-0.2, 0.2, (batch, count, 3))
+    points[..., 2] = rng.uniform(0.0, 0.06, (batch, count))
+    pokes = np.column_stack([rng.uniform(-0.1, 0.1, (batch, 2)), rng.uniform(-3, 3, batch)])
+    return points.astype(dtype), np.ones((batch, count), bool), pokes.astype(dtype)
+
+
+def random_parameters(rng, dtype=np.float64, sizes=SIZES):
+    """Away from the identity initialisation, so that every output depends on every parameter."""
+    return {name: (value + 0.2 * rng.standard_normal(value.shape)).astype(dtype)
+            for name, value in init_parameters(sizes, rng, dtype).items()}
+
+
+def test_untrained_model_predicts_background_and_no_motion():
+    rng = np.random.default_rng(0)
+    points, valid, pokes = scene(rng, dtype=np.float32)
+    prediction = forward_model(init_parameters(SIZES, rng), SIZES, points, valid, pokes)
+    assert prediction.points.dtype == np.float32
+    np.testing.assert_allclose(prediction.points, points, atol=1e-6)
+    assert (prediction.masks.argmax(axis=2) == 0).all()
+    np.testing.assert_allclose(prediction.rotations, np.broadcast_to(np.eye(3), (2, 3, 3, 3)), atol=1e-6)
+
+
+def test_masks_are_a_distribution_and_the_background_never_moves():
+    rng = np.random.default_rng(1)
+    points, valid, pokes = scene(rng)
+    prediction = forward_model(random_parameters(rng), SIZES, points, valid, pokes)
+    assert prediction.masks.shape == (2, 40, 3)
+    np.testing.assert_allclose(prediction.masks.sum(axis=2), 1)
+    assert (prediction.masks > 0).all()
+    np.testing.assert_array_equal(prediction.rotations[:, 0], np.broadcast_to(np.eye(3), (2, 3, 3)))
+    assert not prediction.translations[:, 0].any()
+    assert np.abs(prediction.points - points).max() > 1e-3  # the other masks do move
+    for rotation in prediction.rotations.reshape(-1, 3, 3):
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_a_mask_pushed_to_nothing_keeps_a_gradient():
+    rng = np.random.default_rng(2)
+    points, valid, pokes = scene(rng)
+    params = random_parameters(rng)
+    params["mask_b"] = params["mask_b"] - 20
+
+    def moved(bias):
+        return forward_model({**params, "mask_b": bias}, SIZES, points, valid, pokes).masks[..., 1:].sum()
+    assert np.abs(grad(moved)(params["mask_b"])).min() > 1e-6
+
+
+def test_forward_model_turns_with_the_arena_except_for_its_arena_features():
+    # Points, poke and prediction turned together about z: the poke frame must not notice.
+    rng = np.random.default_rng(3)
+    points, valid, pokes = scene(rng)
+    params = random_parameters(rng)
+    params["trunk_0_w"][19:] = 0  # what comes from the encoder is tied to the arena: switch it off
+    before = forward_model(params, SIZES, points, valid, pokes)
+    turn, _ = poke_axes(np.array([[0, 0, 0.7]]))
+    turned_pokes = np.column_stack([pokes[:, :2] @ turn[0, :2, :2].T, pokes[:, 2] + 0.7])
+    after = forward_model(params, SIZES, points @ turn[0].T, valid, turned_pokes)
+    np.testing.assert_allclose(after.points, before.points @ turn[0].T, atol=1e-10)
+    np.testing.assert_allclose(after.masks, before.masks, atol=1e-10)
+
+
+def test_points_without_depth_do_not_change_the_others():
+    rng = np.random.default_rng(4)
+    points, valid, pokes = scene(rng)
+    params = random_parameters(rng)
+    valid[:, :10] = False
+    first = forward_model(params, SIZES, points, valid, pokes)
+    points[:, :10] = rng.uniform(-1, 1, (2, 10, 3))
+    second = forward_model(params, SIZES, points, valid, pokes)
+    np.testing.assert_allclose(second.points[:, 10:], first.points[:, 10:], atol=1e-12)
+    np.testing.assert_allclose(second.embedding, first.embedding, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(init_parameters(SIZES, np.random.default_rng(0))))
+def test_gradient_of_every_parameter_against_finite_differences(name):
+    rng = np.random.default_rng(5)
+    points, valid, pokes = scene(rng)
+    next_points = points + 0.02 * rng.standard_normal(points.shape)
+    params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
+    readout = [rng.standard_normal(shape) for shape in ((2, 40, 3), (2, 6), (2, 7), (2, 7))]
+
+    def scalar(value):
+        p = {**params, name: value}
+        encoding = encode(p, points, valid)
+        next_features, _ = encode(p, next_points, valid)
+        prediction = forward_model(p, SIZES, points, valid, pokes, encoding)
+        start, end = inverse_model(p, points, next_points, valid, encoding[0], next_features, cells)
+        return sum((a * b).sum() for a, b in zip((prediction.points, prediction.embedding, start, end), readout))
+
+    direction = rng.standard_normal(params[name].shape)
+    step = 1e-7  # small: with relu and max-pooling a longer step may cross a kink
+    expected = (scalar(params[name] + step * direction) - scalar(params[name] - step * direction)) / (2 * step)
+    found = (grad(scalar)(params[name]) * direction).sum()
+    assert abs(expected) > 1e-6
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_siamese_encoder_serves_both_models():
+    rng = np.random.default_rng(6)
+    points, valid, pokes = scene(rng)
+    next_points = points + 0.02 * rng.standard_normal(points.shape)
+    params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
+
+    def forward(w):
+        return forward_model({**params, "encoder_1_w": w}, SIZES, points, valid, pokes).points.sum()
+
+    def inverse(w):
+        p = {**params, "encoder_1_w": w}
+        return inverse_model(p, points, next_points, valid, encode(p, points, valid)[0],
+                             encode(p, next_points, valid)[0], cells)[0][:, 0].sum()
+    for model in (forward, inverse):
+        assert np.abs(grad(model)(params["encoder_1_w"])).max() > 1e-6
+
+
+def test_embedding_is_the_mean_over_valid_points():
+    rng = np.random.default_rng(7)
+    points, valid, _ = scene(rng)
+    valid[0, :15] = False
+    features, embedding = encode(random_parameters(rng), points, valid)
+    np.testing.assert_allclose(embedding[0], features[0, 15:].mean(axis=0))
+    np.testing.assert_allclose(embedding[1], features[1].mean(axis=0))
+
+
+def test_inverse_model_moves_with_the_change():
+    # The same change 7 cm further on is the same poke 7 cm further on, seen on cells 7 cm further on.
+    rng = np.random.default_rng(8)
+    points, valid, _ = scene(rng)
+    next_points = points + 0.02 * rng.standard_normal(points.shape)
+    params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
+    features = rng.standard_normal((2, 2, 40, 6))
+    first = inverse_model(params, points, next_points, valid, *features, cells)
+    shift = np.array([0.07, -0.03, 0])
+    second = inverse_model(params, points + shift, next_points + shift, valid, *features, cells + shift[:2])
+    np.testing.assert_allclose(second, first, atol=1e-9)
+
+
+def test_most_changed_finds_the_moved_points_and_ignores_missing_depth(monkeypatch):
+    monkeypatch.setattr(networks, "CHANGED_POINTS", 5)
+    rng = np.random.default_rng(9)
+    points, valid, _ = scene(rng)
+    next_points = points + 1e-4
+    moved = np.array([3, 8, 20, 21, 39])
+    next_points[:, moved] += rng.uniform(0.02, 0.05, (2, 5, 3))
+    next_points[:, 0] += 1.0
+    valid[:, 0] = False
+    rows, weights = most_changed(points, next_points, valid)
+    np.testing.assert_array_equal(np.sort(rows, axis=1), [moved, moved])
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    lengths = np.linalg.norm(next_points - points, axis=2)
+    np.testing.assert_allclose(weights[0], lengths[0, rows[0]] ** 4 / (lengths[0, rows[0]] ** 4).sum())
+
+
+def test_poke_frame_against_hand_values():
+    pokes = np.array([[0.1, 0.2, np.pi / 2]])  # pushing along the arena's y
+    points = np.array([[[0.1, 0.2, 0.03], [0.1, 0.1, 0.0], [0.0, 0.2, 0.0]]])
+    expected = [[0, 0, 0.03], [-0.1, 0, 0], [0, 0.1, 0]]
+    np.testing.assert_allclose(poke_frame(points, pokes)[0], expected, atol=1e-12)
+    axes, origins = poke_axes(pokes)
+    np.testing.assert_allclose(np.array(expected) @ axes[0].T + origins[0], points[0], atol=1e-12)
+
+
+def test_fourier_against_numpy():
+    x = np.array([[0.03, -0.11]])
+    found = fourier(x, (0.4, 0.1))
+    assert found.shape == (1, 8)
+    expected = [f(2 * np.pi * v / w) for f in (np.sin, np.cos) for v in x[0] for w in (0.4, 0.1)]
+    np.testing.assert_allclose(found[0], expected)
+
+
+def test_pooling_weights_look_at_the_target_and_along_the_path():
+    local = np.array([[[0, 0, 0.03], [-0.1, 0, 0.03], [0.1, 0.1, 0.03], [0, 0, 0.0]]])
+    near, path = pooling_weights(local, np.ones((1, 4), bool))[0]
+    assert near[0] > 0.9 and near[3] == 0  # the last lies on the table
+    np.testing.assert_allclose(path[:2], 0.5, atol=1e-3)
+    assert path[2] == 0
+
+
+@pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("rounds", 0), ("embedding", 0)])
+def test_impossible_sizes(name, value):
+    with pytest.raises(ValueError, match=name):
+        Sizes(**{name: value})

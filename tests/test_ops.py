@@ -1,0 +1,431 @@
+"""Nearest neighbours, bilinear sampling and the fused network operations: values and gradients."""
+import autograd.numpy as anp
+import cv2
+import numpy as np
+import pytest
+import scipy.special
+from autograd import elementwise_grad, grad
+from autograd.test_util import check_grads
+from scipy.ndimage import map_coordinates
+
+from hind4sight_min.ops import (bilinear_sample, dense_relu, max_pool, nearest_squared_distances, softmax,
+                                squared_distances, take)
+
+CV2_MAJOR = int(cv2.__version__.split(".")[0])
+
+
+def pulled_back(function, argnum, g, *args):
+    """Gradient of sum(g * function(*args)) with respect to one argument."""
+    return grad(lambda *args: anp.sum(g * function(*args)), argnum)(*args)
+
+
+# --- nearest neighbours -----------------------------------------------------------------------------------
+
+def test_squared_distances_and_gradients_when_references_are_shared_or_unused():
+    rng = np.random.default_rng(0)
+    queries, references, g = rng.normal(size=(4, 3)), rng.normal(size=(5, 3)), rng.normal(size=4)
+    indices = np.array([2, 0, 2, 2])  # 2 collects from three queries; 1, 3 and 4 are nobody's neighbour
+    value = squared_distances(queries, references, indices)
+    expected, dq, dr = np.zeros(4), np.zeros((4, 3)), np.zeros((5, 3))
+    for i, j in enumerate(indices):
+        difference = queries[i] - references[j]
+        expected[i] = difference @ difference
+        dq[i] = 2 * g[i] * difference
+        dr[j] -= 2 * g[i] * difference
+    assert value.shape == (4,)
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    for argnum, wanted in ((0, dq), (1, dr)):
+        found = pulled_back(squared_distances, argnum, g, queries, references, indices)
+        assert found.shape == wanted.shape
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    check_grads(squared_distances, (0, 1), modes=["rev"], order=1)(queries, references, indices)
+
+
+def brute_force(queries, references, valid):
+    """All pairs; -> squared distances (B, N) and the index of each query's nearest valid reference."""
+    pairs = ((queries[:, :, None] - references[:, None]) ** 2).sum(axis=3)
+    pairs[np.broadcast_to(~valid[:, None], pairs.shape)] = np.inf
+    return pairs.min(axis=2), pairs.argmin(axis=2)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_nearest_squared_distances_match_brute_force(dimensions, share):
+    # Eq. (2), one direction
+    rng = np.random.default_rng(1)
+    queries, references = rng.normal(size=(3, 20, dimensions)), rng.normal(size=(3, 14, dimensions))
+    valid = rng.random((3, 14)) < share
+    g = rng.normal(size=(3, 20))
+    value = nearest_squared_distances(queries, references, valid)
+    expected, nearest = brute_force(queries, references, valid)
+    assert value.shape == (3, 20)
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    dq, dr = np.zeros_like(queries), np.zeros_like(references)
+    for b, i in np.ndindex(3, 20):
+        pull = 2 * g[b, i] * (queries[b, i] - references[b, nearest[b, i]])
+        dq[b, i] = pull
+        dr[b, nearest[b, i]] -= pull
+    for argnum, wanted in ((0, dq), (1, dr)):
+        found = pulled_back(nearest_squared_distances, argnum, g, queries, references, valid)
+        assert found.shape == wanted.shape
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+    assert not dr[~valid].any() and dr[valid].any()
+    # No two references are equally near, so the neighbours do not change within a finite difference.
+    check_grads(nearest_squared_distances, (0, 1), modes=["rev"], order=1)(queries, references, valid)
+
+
+def test_an_invalid_reference_is_ignored_even_where_it_is_the_nearest():
+    queries = np.array([[[1.0, 0, 0], [0, 2, 0]]])
+    references = np.array([[[1.0, 0, 0], [4, 0, 0], [0, 2, 0.1]]])  # the first and the last sit on the queries
+    valid = np.array([[False, True, False]])
+    value = nearest_squared_distances(queries, references, valid)
+    np.testing.assert_allclose(value, [[9, 20]])
+    gradient = pulled_back(nearest_squared_distances, 1, 1.0, queries, references, valid)
+    np.testing.assert_allclose(gradient, [[[0, 0, 0], [2 * 3 + 2 * 4, -2 * 2, 0], [0, 0, 0]]])
+
+
+def test_the_clouds_of_a_batch_do_not_see_each_other():
+    queries = np.array([[[0.0, 0, 0]], [[5, 0, 0]]])
+    references = queries[::-1] + [0, 1, 0]  # the other cloud's reference would be nearer
+    value = nearest_squared_distances(queries, references, np.ones((2, 1), bool))
+    np.testing.assert_allclose(value, [[26], [26]])
+    gradient = pulled_back(nearest_squared_distances, 1, np.array([[1.0], [3.0]]), queries, references,
+                           np.ones((2, 1), bool))
+    np.testing.assert_allclose(gradient, [[[10, 2, 0]], [[-30, 6, 0]]])
+
+
+@pytest.mark.parametrize("queries, references, valid", [
+    ((5, 3), (2, 4, 3), (2, 4)), ((2, 5, 3), (4, 3), (2, 4)), ((2, 5, 3), (3, 4, 3), (3, 4)),
+    ((2, 5, 3), (2, 4, 2), (2, 4)), ((2, 5, 3), (2, 4, 3), (2, 5)), ((2, 5, 3), (2, 4, 3), (2, 4, 1))])
+def test_nearest_squared_distances_refuse_other_shapes(queries, references, valid):
+    with pytest.raises(ValueError, match="queries, references, valid"):
+        nearest_squared_distances(np.ones(queries), np.ones(references), np.ones(valid, bool))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("which", [0, 1])
+def test_nearest_squared_distances_refuse_points_that_are_not_finite(which, bad):
+    clouds = [np.ones((2, 5, 3)), np.ones((2, 4, 3))]
+    clouds[which][1, 2, 0] = bad
+    with pytest.raises(ValueError, match=("queries", "references")[which] + ".*finite"):
+        nearest_squared_distances(*clouds, np.ones((2, 4), bool))
+
+
+def test_nearest_squared_distances_refuse_a_cloud_without_a_valid_reference():
+    valid = np.array([[True, False], [False, False]])  # the second cloud has none
+    with pytest.raises(ValueError, match="valid"):
+        nearest_squared_distances(np.ones((2, 5, 3)), np.ones((2, 2, 3)), valid)
+
+
+# --- bilinear sampling ------------------------------------------------------------------------------------
+
+def interpolated(images, positions):
+    """The oracle: SciPy's linear interpolation with the border repeated."""
+    sampled = [[map_coordinates(image[..., c], xy.T[::-1].astype(float), order=1, mode="nearest")
+                for c in range(image.shape[2])] for image, xy in zip(images, positions)]
+    return np.moveaxis(np.array(sampled), 1, 2)
+
+
+def grid_positions(rng, batch, count, low, high):
+    """Random positions that are multiples of 1/32 px, where every OpenCV samples exactly."""
+    return rng.integers(np.multiply(low, 32), np.multiply(high, 32), (batch, count, 2), endpoint=True) / 32
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("channels", [1, 2, 3])
+def test_bilinear_sample_on_the_grid_of_1_32_matches_scipy_exactly(dtype, channels):
+    # Eq. (3)
+    rng = np.random.default_rng(2)
+    images = rng.random((2, 5, 7, channels)).astype(dtype)
+    positions = grid_positions(rng, 2, 60, (-3, -3), (9, 7)).astype(dtype)  # inside and outside
+    value = bilinear_sample(images, positions)
+    assert value.shape == (2, 60, channels) and value.dtype == dtype
+    np.testing.assert_allclose(value, interpolated(images, positions), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_bilinear_sample_at_arbitrary_positions_matches_scipy(dtype):
+    # Eq. (3)
+    rng = np.random.default_rng(3)
+    images = rng.random((2, 5, 7, 3)).astype(dtype)
+    positions = rng.uniform((-2, -2), (8, 6), (2, 80, 2)).astype(dtype)
+    value = bilinear_sample(images, positions)
+    # Where positions are rounded to 1/32 px: half of that, along x and along y, on slopes of at most 1 per px.
+    exact = CV2_MAJOR >= 5 and dtype == np.float32
+    assert value.shape == (2, 80, 3)
+    np.testing.assert_allclose(value, interpolated(images, positions), rtol=0, atol=1e-5 if exact else 1 / 32)
+
+
+@pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 2500])
+def test_bilinear_sample_keeps_the_order_of_lists_of_any_length(count):
+    # The list is folded into rows of 1024 for OpenCV.
+    rng = np.random.default_rng(4)
+    images = rng.random((2, 4, 6, 2))
+    positions = grid_positions(rng, 2, count, (0, 0), (5, 3))
+    value = bilinear_sample(images, positions)
+    assert value.shape == (2, count, 2)
+    np.testing.assert_allclose(value, interpolated(images, positions), rtol=0, atol=1e-6)
+
+
+def test_bilinear_sample_at_whole_half_and_border_positions():
+    images = np.arange(1.0, 13).reshape(1, 3, 4, 1) ** 2  # rows 1 4 9 16, 25 36 49 64, 81 100 121 144
+    positions = np.array([[[1, 0], [2, 1], [0.5, 0], [1, 0.5], [1.5, 1.5],
+                           [0, 0], [3, 0], [0, 2], [3, 2], [2.5, 2], [3, 1.5]]])
+    expected = [4, 49, (1 + 4) / 2, (4 + 36) / 2, (36 + 49 + 100 + 121) / 4,
+                1, 16, 81, 144, (121 + 144) / 2, (64 + 144) / 2]
+    np.testing.assert_allclose(bilinear_sample(images, positions)[0, :, 0], expected, rtol=1e-6)
+
+
+def test_outside_the_picture_the_border_is_repeated():
+    images = np.arange(1.0, 13).reshape(1, 3, 4, 1) ** 2
+    positions = np.array([[[-5, 1.5], [1e6, 1.5], [0.5, -0.25], [0.5, 99], [-1, -1], [4, 3], [-7, 50]]])
+    value = bilinear_sample(images, positions)
+    np.testing.assert_allclose(value[0, :, 0], [(25 + 81) / 2, (64 + 144) / 2, 2.5, 90.5, 1, 144, 81], rtol=1e-6)
+    gradient = elementwise_grad(bilinear_sample, 1)(images, positions)
+    # No slope across the border; along it the picture still has one.
+    np.testing.assert_allclose(gradient[0], [[0, 81 - 25], [0, 144 - 64], [3, 0], [19, 0], [0, 0], [0, 0], [0, 0]])
+    on_border = elementwise_grad(bilinear_sample, 0)(images, positions)
+    expected = np.zeros((3, 4))
+    for (row, column), weight in {(1, 0): 0.5, (2, 0): 0.5 + 0.5 + 1, (1, 3): 0.5, (2, 3): 0.5 + 1,
+                                  (0, 0): 0.5 + 1, (0, 1): 0.5, (2, 1): 0.5}.items():
+        expected[row, column] = weight
+    np.testing.assert_allclose(on_border[0, :, :, 0], expected)
+
+
+def test_bilinear_position_gradient_matches_central_differences():
+    # Eq. (3)
+    rng = np.random.default_rng(5)
+    images, g = rng.random((2, 5, 7, 3)), rng.normal(size=(2, 30, 3))
+    cells = rng.integers((-1, -1), (8, 6), (2, 30, 2))  # some of them outside
+    positions = cells + rng.integers(2, 31, (2, 30, 2)) / 32  # one step of 1/32 px stays in the cell
+    found = pulled_back(bilinear_sample, 1, g, images, positions)
+    assert found.shape == positions.shape
+    for axis in range(2):
+        step = np.eye(2)[axis] / 32
+        difference = bilinear_sample(images, positions + step) - bilinear_sample(images, positions - step)
+        np.testing.assert_allclose(found[..., axis], (g * difference).sum(axis=2) * 16, rtol=0, atol=1e-5)
+    inside = ((positions > 0) & (positions < [6, 4])).all(axis=2)
+    assert 5 < inside.sum() < 55 and np.abs(found[inside]).min() > 1e-4
+
+
+@pytest.mark.parametrize("position, step", [((2, 1), (1, 1)), ((0, 0), (1, 1)), ((6, 4), (-1, -1)),
+                                            ((6, 2), (-1, 1)), ((3, 4), (1, -1))])
+def test_bilinear_position_gradient_on_a_whole_pixel_is_that_of_a_cell_beside_it(position, step):
+    # To the right and below; on the last column or row the last cell of the picture, never beyond it.
+    rng = np.random.default_rng(6)
+    images, positions = rng.random((1, 5, 7, 1)), np.array([[position]], float)
+    found = elementwise_grad(bilinear_sample, 1)(images, positions)[0, 0]
+    for axis in range(2):
+        one = step[axis] * np.eye(2)[axis]  # bilinear, so a whole pixel is as good as a small step
+        difference = bilinear_sample(images, positions + one) - bilinear_sample(images, positions)
+        np.testing.assert_allclose(found[axis], difference[0, 0, 0] * step[axis], rtol=0, atol=1e-5)
+        assert abs(found[axis]) > 0.01
+
+
+def test_bilinear_image_gradient_matches_explicit_weights_and_finite_differences():
+    # Eq. (3)
+    rng = np.random.default_rng(7)
+    images, g = rng.random((2, 4, 5, 2)), rng.normal(size=(2, 25, 2))
+    positions = grid_positions(rng, 2, 25, (-1, -1), (5, 4))  # more positions than pixels: they add up
+    found = pulled_back(bilinear_sample, 0, g, images, positions)
+    expected = np.zeros_like(images)
+    for b, n in np.ndindex(2, 25):
+        x, y = np.clip(positions[b, n], 0, [4, 3])
+        for row, column in np.ndindex(4, 5):  # the hat function around each pixel
+            expected[b, row, column] += max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row)) * g[b, n]
+    assert found.shape == images.shape
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    check_grads(bilinear_sample, modes=["rev"], order=1)(images, positions)
+
+
+@pytest.mark.parametrize("height, width", [(4, 1), (1, 5), (1, 1)])
+def test_bilinear_sample_of_a_picture_one_pixel_wide_or_high(height, width):
+    rng = np.random.default_rng(8)
+    images, g = rng.random((2, height, width, 2)), rng.normal(size=(2, 12, 2))
+    cells = rng.integers((-1, -1), (width, height), (2, 12, 2), endpoint=True)
+    positions = cells + rng.integers(2, 31, (2, 12, 2)) / 32
+    value = bilinear_sample(images, positions)
+    assert value.shape == (2, 12, 2)
+    np.testing.assert_allclose(value, interpolated(images, positions), rtol=0, atol=1e-6)
+    check_grads(bilinear_sample, modes=["rev"], order=1)(images, positions)
+    found = pulled_back(bilinear_sample, 1, g, images, positions)
+    for axis in range(2):
+        step = np.eye(2)[axis] / 32
+        difference = bilinear_sample(images, positions + step) - bilinear_sample(images, positions - step)
+        np.testing.assert_allclose(found[..., axis], (g * difference).sum(axis=2) * 16, rtol=0, atol=1e-5)
+    assert bool(found[..., 0].any()) is (width > 1) and bool(found[..., 1].any()) is (height > 1)
+
+
+@pytest.mark.parametrize("images, positions", [
+    ((4, 5, 3), (2, 6, 2)), ((2, 4, 5, 3), (6, 2)), ((2, 4, 5, 3), (2, 6, 3)), ((2, 4, 5, 3), (3, 6, 2)),
+    ((2, 4, 5, 3), (2, 4, 5, 2))])
+def test_bilinear_sample_refuses_other_shapes(images, positions):
+    with pytest.raises(ValueError, match="images, positions"):
+        bilinear_sample(np.ones(images), np.ones(positions))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_bilinear_sample_refuses_positions_that_are_not_finite(bad):
+    positions = np.ones((2, 6, 2))
+    positions[1, 3, 0] = bad  # OpenCV would read 0 there and say nothing
+    with pytest.raises(ValueError, match="positions.*finite"):
+        bilinear_sample(np.ones((2, 4, 5, 3)), positions)
+
+
+# --- fused network operations -----------------------------------------------------------------------------
+
+@pytest.mark.parametrize("per_cloud", [False, True])
+def test_dense_relu_and_gradients_match_numpy(per_cloud):
+    rng = np.random.default_rng(9)
+    x, weights = rng.normal(size=(3, 5, 4)), rng.normal(size=(4, 6))
+    bias, g = rng.normal(size=(3, 6) if per_cloud else 6), rng.normal(size=(3, 5, 6))
+    before = np.einsum("bni,io->bno", x, weights) + (bias[:, None] if per_cloud else bias)
+    value = dense_relu(x, weights, bias)
+    assert value.shape == (3, 5, 6)
+    np.testing.assert_allclose(value, np.maximum(before, 0), rtol=0, atol=1e-12)
+    through = g * (before > 0)
+    assert 20 < (before > 0).sum() < 70  # both sides of the kink
+    expected = (np.einsum("bno,io->bni", through, weights), np.einsum("bno,bni->io", through, x),
+                through.sum(axis=1) if per_cloud else through.sum(axis=(0, 1)))
+    together = grad(lambda args: anp.sum(g * dense_relu(*args)))((x, weights, bias))
+    for argnum, wanted in enumerate(expected):
+        alone = pulled_back(dense_relu, argnum, g, x, weights, bias)
+        for found in (alone, together[argnum]):
+            assert found.shape == wanted.shape
+            np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
+    check_grads(dense_relu, (0, 1, 2), modes=["rev"], order=1)(x, weights, bias)
+
+
+def test_dense_relu_changes_none_of_its_inputs():
+    rng = np.random.default_rng(10)
+    inputs = [rng.normal(size=shape) for shape in ((2, 3, 4), (4, 5), (2, 5))]
+    copies = [value.copy() for value in inputs]
+    dense_relu(*inputs)
+    for value, copy in zip(inputs, copies):
+        np.testing.assert_array_equal(value, copy)
+
+
+@pytest.mark.parametrize("key", [
+    slice(1, 3), slice(None, None, -2), (slice(None), slice(None, -1)), (..., slice(2, 3)), (..., 1), 2,
+    (slice(None), slice(1, None), slice(0, 2)), (np.array([3, 0]), np.array([1, 4])),
+    (np.array([[3], [0]]), np.array([[1, 4]]), slice(1, 3)), np.array([2, 0, 3])])
+def test_take_and_its_gradient(key):
+    rng = np.random.default_rng(11)
+    x = rng.normal(size=(4, 5, 3))
+    value = take(x, key)
+    assert value.shape == x[key].shape
+    np.testing.assert_array_equal(value, x[key])
+    g = rng.normal(size=value.shape)
+    expected = np.zeros_like(x)
+    expected[key] = g
+    found = pulled_back(take, 0, g, x, key)
+    assert found.shape == x.shape
+    np.testing.assert_array_equal(found, expected)
+    check_grads(take, modes=["rev"], order=1)(x, key)
+
+
+def test_gradients_of_overlapping_takes_add_up():
+    x = np.random.default_rng(12).normal(size=5)
+    gradient = grad(lambda x: anp.sum(take(x, slice(1, None)) ** 2) + 3 * anp.sum(take(x, slice(None, 3)))
+                    + anp.sum(x * x))(x)
+    np.testing.assert_allclose(gradient, 2 * x + 2 * x * [0, 1, 1, 1, 1] + [3, 3, 3, 0, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_max_pool_and_its_gradient_see_the_valid_points_only(share):
+    rng = np.random.default_rng(13)
+    x, valid, g = rng.random((3, 6, 4)), rng.random((3, 6)) < share, rng.normal(size=(3, 4))
+    x[~valid] += 5  # the largest of all, were they counted
+    value, expected, gradient = max_pool(x, valid), np.zeros((3, 4)), np.zeros_like(x)
+    for b, c in np.ndindex(3, 4):
+        rows = np.flatnonzero(valid[b])
+        winner = rows[np.argmax(x[b, rows, c])]
+        expected[b, c], gradient[b, winner, c] = x[b, winner, c], g[b, c]
+    assert value.shape == (3, 4)
+    np.testing.assert_array_equal(value, expected)
+    found = pulled_back(max_pool, 0, g, x, valid)
+    assert found.shape == x.shape
+    np.testing.assert_array_equal(found, gradient)
+    check_grads(max_pool, modes=["rev"], order=1)(x, valid)
+
+
+def test_max_pool_is_zero_with_zero_gradient_where_nothing_is_valid():
+    x = np.random.default_rng(14).random((2, 3, 4)) + 1
+    valid = np.array([[False, False, False], [False, True, False]])
+    expected = np.zeros_like(x)
+    expected[1, 1] = 1
+    np.testing.assert_array_equal(max_pool(x, valid), [np.zeros(4), x[1, 1]])
+    np.testing.assert_array_equal(pulled_back(max_pool, 0, 1.0, x, valid), expected)
+
+
+def test_max_pool_of_zeros_does_not_pick_an_invalid_point():
+    x = np.zeros((1, 3, 2))
+    x[0, 0] = 7  # invalid, first, and as large as the valid ones once masked
+    valid = np.array([[False, True, True]])
+    np.testing.assert_array_equal(max_pool(x, valid), [[0, 0]])
+    assert not pulled_back(max_pool, 0, 1.0, x, valid)[0, 0].any()
+
+
+def test_softmax_and_its_gradient_match_scipy_and_finite_differences():
+    rng = np.random.default_rng(15)
+    logits, g = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 4))
+    value = softmax(logits)
+    assert value.shape == logits.shape
+    np.testing.assert_allclose(value, scipy.special.softmax(logits, axis=-1), rtol=1e-12)
+    found = pulled_back(softmax, 0, g, logits)
+    assert found.shape == logits.shape
+    for index in np.ndindex(2, 5):
+        p = value[index]
+        np.testing.assert_allclose(found[index], (np.diag(p) - np.outer(p, p)) @ g[index], rtol=0, atol=1e-14)
+    check_grads(softmax, modes=["rev"], order=1)(logits)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shift", [1e4, -1e4])
+def test_softmax_of_huge_logits_neither_overflows_nor_underflows(dtype, shift):
+    logits = np.array([[0, 0.5, -1], [0, 3e3, 0]], dtype) + dtype(shift)
+    value = softmax(logits)
+    gradient = pulled_back(softmax, 0, np.array([1, -2, 3], dtype), logits)
+    p = scipy.special.softmax([0, 0.5, -1])
+    assert value.dtype == gradient.dtype == dtype
+    np.testing.assert_allclose(value, [p, [0, 1, 0]], rtol=1e-6)
+    np.testing.assert_allclose(gradient, [(np.diag(p) - np.outer(p, p)) @ [1, -2, 3], [0, 0, 0]], atol=1e-6)
+
+
+# --- dtype ------------------------------------------------------------------------------------------------
+
+def dtype_cases():
+    rng = np.random.default_rng(16)
+    queries, references, valid = rng.normal(size=(2, 6, 3)), rng.normal(size=(2, 5, 3)), rng.random((2, 5)) < 0.7
+    indices = np.array([0, 2, 2, 1, 4, 0])
+    images, positions = rng.random((2, 4, 5, 3)), grid_positions(rng, 2, 9, (-1, -1), (5, 4)) + 1 / 64
+    x, weights, bias = rng.normal(size=(2, 5, 3)), rng.normal(size=(3, 4)), rng.normal(size=4)
+    yield squared_distances, 0, (queries[0], references[0], indices)
+    yield squared_distances, 1, (queries[0], references[0], indices)
+    yield nearest_squared_distances, 0, (queries, references, valid)
+    yield nearest_squared_distances, 1, (queries, references, valid)
+    yield bilinear_sample, 0, (images, positions - 1 / 64)
+    yield bilinear_sample, 1, (images, positions)  # a position on the grid may be a kink
+    for argnum in range(3):
+        yield dense_relu, argnum, (x, weights, bias)
+        yield dense_relu, argnum, (x, weights, rng.normal(size=(2, 4)))
+    yield take, 0, (x, (slice(None), slice(1, 3)))
+    yield take, 0, (x, (np.array([1, 0]), np.array([3, 4])))
+    yield max_pool, 0, (np.abs(x), np.ones((2, 5), bool))
+    yield max_pool, 0, (np.abs(x), np.array([[True, False, True, True, False]] * 2))
+    yield softmax, 0, (x,)
+
+
+@pytest.mark.parametrize("function, argnum, args", [
+    pytest.param(*case, id=f"{case[0].__name__}-{case[1]}-{i}") for i, case in enumerate(dtype_cases())])
+def test_float32_in_gives_float32_out_and_the_same_numbers(function, argnum, args):
+    single = [a.astype(np.float32) if isinstance(a, np.ndarray) and a.dtype == float else a for a in args]
+    value = function(*single)
+    g = np.random.default_rng(17).normal(size=value.shape)
+    gradient = pulled_back(function, argnum, g.astype(np.float32), *single)
+    assert value.dtype == gradient.dtype == np.float32
+    assert gradient.shape == args[argnum].shape
+    tolerance = 1 / 32 if function is bilinear_sample and argnum == 1 else 1e-5  # OpenCV's rounding, see above
+    np.testing.assert_allclose(value, function(*args), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(gradient, pulled_back(function, argnum, g, *args), rtol=0, atol=1e-5)
+    assert np.abs(gradient).max() > 0.1

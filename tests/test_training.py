@@ -1,0 +1,259 @@
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from hind4sight_min import losses, training
+from hind4sight_min.geometry import Camera, look_at, project, unproject
+from hind4sight_min.interactions import Interactions, cells_of
+from hind4sight_min.networks import Sizes
+from hind4sight_min.training import Recipe, batch_gradient, make_batch, start_run, train, unflatten
+
+SETTINGS = {"arena": 0.5, "cell": 0.025}
+SIZES = Sizes(masks=3, width=8, embedding=6)
+TINY = Recipe(steps=6, batch=5, warmup=2, seed=3, sizes=SIZES)
+
+
+def camera(x=0.0):
+    return Camera(16, 12, 20.0, 20.0, 7.5, 5.5, look_at([x, -0.46, 0.62], [x, 0, 0]))
+
+
+def pokes_seen(count=7, seed=0, x=0.0):
+    """A block on a tilted view of a table; the block is somewhere else after the poke."""
+    rng = np.random.default_rng(seed)
+    table = np.full((12, 16), 0.7, np.float32) + 0.01 * np.arange(12, 0, -1, dtype=np.float32)[:, None]
+    depth, rgb = [], []
+    for _ in range(2):
+        d = np.repeat(table[None], count, axis=0)
+        c = rng.integers(60, 200, (count, 12, 16, 3), dtype=np.uint8)
+        for i in range(count):
+            v, u = rng.integers(2, 7), rng.integers(2, 11)
+            d[i, v:v + 3, u:u + 3] -= 0.05
+            c[i, v:v + 3, u:u + 3, 0] = 255
+        depth.append(d)
+        rgb.append(c)
+    cam = camera(x)
+    meta = {"settings": SETTINGS, "camera": {**asdict(cam), "arena_from_camera": cam.arena_from_camera.tolist()}}
+    pokes = np.column_stack([rng.uniform(-0.15, 0.15, (count, 2)), rng.uniform(-3, 3, count)]).astype(np.float32)
+    starts = pokes[:, :2] - 0.05
+    return Interactions(rgb[0], rgb[1], depth[0], depth[1], pokes, starts, table, cam, meta)
+
+
+def random_run(recipe=TINY, seed=0):
+    """A run away from its identity initialisation."""
+    run = start_run(recipe, pokes_seen())
+    run.vector = run.vector + 0.1 * np.random.default_rng(seed).standard_normal(run.vector.shape).astype(np.float32)
+    return run
+
+
+def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
+    data, run = pokes_seen(), random_run()
+    batch = make_batch(data, np.arange(3))
+    for name, value in vars(batch).items():  # float64 throughout
+        if value.dtype == np.float32:
+            setattr(batch, name, value.astype(float))
+    vector, weights = run.vector.astype(float), dict(training.WEIGHTS, photometric=0.0)
+    # cv2.remap rounds float64 positions, so the photometric term has finite differences of its own
+    # in test_ops and test_losses.
+    terms, gradient = batch_gradient(vector, run.layout, SIZES, batch, data.camera, weights)
+    rng, step = np.random.default_rng(1), 1e-7
+    for _ in range(5):
+        direction = rng.standard_normal(vector.shape)
+        values = []
+        for sign in (1, -1):
+            t, _ = batch_gradient(vector + sign * step * direction, run.layout, SIZES, batch, data.camera, weights)
+            values.append(sum(weights[name] * t[name] for name in t))
+        expected = (values[0] - values[1]) / (2 * step)
+        assert abs(expected) > 1e-3
+        np.testing.assert_allclose(gradient @ direction, expected, rtol=2e-3)
+    assert all(value > 0 for value in terms.values())
+
+
+def test_every_term_reaches_the_forward_model_and_every_ablation_is_a_zero():
+    data, run = pokes_seen(), random_run()
+    batch = make_batch(data, np.arange(3))
+    zero = dict.fromkeys(training.WEIGHTS, 0.0)
+    for name in training.WEIGHTS:
+        _, gradient = batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, {**zero, name: 1.0})
+        parts = unflatten(gradient, run.layout)
+        assert np.abs(parts["encoder_1_w"]).max() > 0, name
+        assert (np.abs(parts["mask_w"]).max() > 0) == (name != "inverse")
+        assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
+    _, gradient = batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, zero)
+    assert not gradient.any()
+
+
+def test_training_lowers_the_loss_it_trains():
+    data = pokes_seen()
+    recipe = replace(TINY, steps=40, batch=7, mirror=False, learning_rate=2e-2)
+    log = train(data, start_run(recipe, data)).log
+    assert log[-1]["inverse"] < 0.8 * log[0]["inverse"]
+
+
+def test_the_same_seed_gives_the_same_run_on_any_number_of_threads():
+    data = pokes_seen()
+    runs = [train(data, start_run(TINY, data), threads=threads) for threads in (1, 2, 3)]
+    for other in runs[1:]:
+        np.testing.assert_array_equal(other.vector, runs[0].vector)
+        assert other.log == runs[0].log
+    assert not np.array_equal(train(data, start_run(replace(TINY, seed=4), data)).vector, runs[0].vector)
+
+
+def test_a_resumed_run_is_the_same_run(tmp_path):
+    data, whole = pokes_seen(), train(pokes_seen(), start_run(TINY, pokes_seen()))
+
+    class Stop(Exception):
+        pass
+
+    def stop_at_four(run):
+        training.save_run(tmp_path / "run.npz", run)
+        if run.step == 4:
+            raise Stop
+    with pytest.raises(Stop):
+        train(data, start_run(TINY, data), on_step=stop_at_four)
+    resumed = training.load_run(tmp_path / "run.npz")
+    assert resumed.step == 4
+    train(data, resumed)
+    np.testing.assert_array_equal(resumed.vector, whole.vector)
+    assert json.loads(json.dumps(resumed.log)) == json.loads(json.dumps(whole.log))
+
+
+def test_training_with_depth_noise_differs_and_repeats():
+    data, noisy = pokes_seen(), replace(TINY, depth_noise=0.01)
+    first, second = (train(data, start_run(noisy, data)).vector for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, train(data, start_run(TINY, data)).vector)
+
+
+def test_adam_against_its_formula():
+    run = random_run()
+    start, gradients = run.vector.astype(float), [np.random.default_rng(i).standard_normal(len(run.vector)) for i in (1, 2)]
+    for g in gradients:
+        training.adam_step(run, g.astype(np.float32), 0.01)
+    m1, v1 = 0.1 * gradients[0], 0.001 * gradients[0] ** 2
+    expected = start - 0.01 * (m1 / 0.1) / (np.sqrt(v1 / 0.001) + 1e-8)
+    m2, v2 = 0.9 * m1 + 0.1 * gradients[1], 0.999 * v1 + 0.001 * gradients[1] ** 2
+    expected -= 0.01 * (m2 / (1 - 0.9 ** 2)) / (np.sqrt(v2 / (1 - 0.999 ** 2)) + 1e-8)
+    np.testing.assert_allclose(run.vector, expected, atol=1e-5)
+    assert np.abs(run.vector - start).min() > 1e-8
+
+
+def test_every_epoch_shows_every_row_once():
+    recipe = replace(TINY, batch=5)
+    rows = np.concatenate([training.rows_of_step(recipe, 7, step)[0] for step in range(7)])  # 35 = 5 epochs of 7
+    for epoch in rows.reshape(5, 7):
+        np.testing.assert_array_equal(np.sort(epoch), np.arange(7))
+    assert len({tuple(epoch) for epoch in rows.reshape(5, 7)}) > 1
+    np.testing.assert_array_equal(np.bincount(training.rows_of_step(replace(TINY, batch=20), 7, 0)[0]) >= 2, True)
+
+
+def test_the_mirrored_batch_is_the_mirrored_world():
+    data = pokes_seen()
+    plain, mirrored = make_batch(data, np.arange(3)), make_batch(data, np.arange(3), mirror=True)
+    flip = [-1, 1, 1]
+    for name in ("points", "next_points"):
+        there = getattr(mirrored, name).reshape(3, 12, 16, 3)[:, :, ::-1] * flip
+        np.testing.assert_allclose(there, getattr(plain, name).reshape(3, 12, 16, 3), atol=1e-6)
+    np.testing.assert_array_equal(mirrored.images[:, :, ::-1], plain.images)
+    np.testing.assert_allclose(mirrored.pokes[:, :2], plain.pokes[:, :2] * [-1, 1])
+    for f, sign in ((np.cos, -1), (np.sin, 1)):
+        np.testing.assert_allclose(f(mirrored.pokes[:, 2]), sign * f(plain.pokes[:, 2]), atol=1e-6)
+    np.testing.assert_array_equal(mirrored.start_cells, cells_of(data.starts[:3] * [-1, 1], SETTINGS))
+    np.testing.assert_array_equal(mirrored.end_cells, cells_of(data.pokes[:3, :2] * [-1, 1], SETTINGS))
+    # and its pictures still fit its points
+    pixels = project(mirrored.points[0], data.camera).reshape(12, 16, 2)
+    np.testing.assert_allclose(pixels[4, 9], [9, 4], atol=1e-3)
+
+
+def test_only_the_marked_rows_are_mirrored():
+    data = pokes_seen()
+    plain, both = make_batch(data, np.array([2, 2])), make_batch(data, np.array([2, 2]), mirror=[False, True])
+    np.testing.assert_array_equal(both.points[0], plain.points[0])
+    assert not np.array_equal(both.points[1], plain.points[1])
+    np.testing.assert_array_equal(data.pokes, pokes_seen().pokes)  # the data set itself is untouched
+
+
+def test_batch_against_the_data():
+    data = pokes_seen()
+    data.depth_before[1, 3, 4] = 0
+    batch = make_batch(data, np.array([1, 4]))
+    np.testing.assert_array_equal(batch.points.reshape(2, 12, 16, 3), unproject(data.depth_before[[1, 4]], data.camera))
+    assert (~batch.valid).sum() == 1 and not batch.valid[0, 3 * 16 + 4] and batch.next_valid.all()
+    np.testing.assert_allclose(batch.next_images, data.rgb_after[[1, 4]] / 255, atol=1e-7)
+    assert batch.points.dtype == batch.images.dtype == batch.pokes.dtype == np.float32
+
+
+def test_mirroring_needs_a_symmetric_camera():
+    with pytest.raises(ValueError, match="mirror"):
+        make_batch(pokes_seen(x=0.1), np.arange(2), mirror=True)
+
+
+def test_weight_schedule_ramps_the_2d_terms_only():
+    recipe = replace(TINY, steps=100, ramp=(0.2, 0.6))
+    for step, share in ((0, 0.0), (20, 0.0), (40, 0.5), (60, 1.0), (99, 1.0)):
+        weights = training.weights_at(recipe, step)
+        for name, value in training.WEIGHTS.items():
+            expected = share * value if name in ("photometric", "flow_smoothness") else value
+            assert weights[name] == pytest.approx(expected), (step, name)
+    assert set(weights) == set(losses.PAPER_WEIGHTS)
+
+
+def test_learning_rate_schedule():
+    recipe = replace(TINY, steps=100, warmup=10, learning_rate=0.5)
+    rates = [training.learning_rate(recipe, step) for step in range(100)]
+    assert rates[0] == pytest.approx(0.05) and max(rates) < 0.5 and rates[50] == pytest.approx(0.25)
+    assert rates[-1] < 1e-3 and (np.diff(rates[10:]) < 0).all()
+
+
+def test_checkpoint_round_trip(tmp_path):
+    run = train(pokes_seen(), start_run(TINY, pokes_seen()))
+    training.save_run(tmp_path / "a.npz", run)
+    loaded = training.load_run(tmp_path / "a.npz")
+    for name in ("vector", "first_moment", "second_moment"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(run, name))
+    assert loaded.recipe == run.recipe and loaded.layout == run.layout and loaded.meta == run.meta
+    training.save_run(tmp_path / "b.npz", run, resumable=False)
+    assert (tmp_path / "b.npz").stat().st_size < 0.6 * (tmp_path / "a.npz").stat().st_size
+    np.testing.assert_array_equal(training.load_run(tmp_path / "b.npz").vector, run.vector)
+
+
+@pytest.mark.parametrize("keep", [0, 10, 500, -20])
+def test_truncated_checkpoint(tmp_path, keep):
+    path = tmp_path / "run.npz"
+    training.save_run(path, random_run())
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ValueError, match="run.npz"):
+        training.load_run(path)
+
+
+def test_checkpoint_with_wrong_contents(tmp_path):
+    run, path = random_run(), tmp_path / "run.npz"
+    run.vector = run.vector[:-1]
+    training.save_run(path, run)
+    with pytest.raises(ValueError, match="run.npz: vector"):
+        training.load_run(path)
+    run = random_run()
+    run.vector[5] = np.nan
+    training.save_run(path, run)
+    with pytest.raises(ValueError, match="run.npz: vector"):
+        training.load_run(path)
+
+
+def test_bad_arguments():
+    data = pokes_seen()
+    with pytest.raises(ValueError, match="threads"):
+        train(data, start_run(TINY, data), threads=0)
+    with pytest.raises(ValueError, match="camera"):
+        train(pokes_seen(x=0.1), start_run(TINY, data))
+    for name in ("steps", "batch", "learning_rate"):
+        with pytest.raises(ValueError, match=name):
+            Recipe(**{name: 0})
+
+
+def test_a_gradient_that_is_not_finite_stops_the_run():
+    data = pokes_seen()
+    run = start_run(TINY, data)
+    run.vector[:] = np.nan
+    with pytest.raises((FloatingPointError, ValueError)), np.errstate(invalid="ignore"):
+        train(data, run)
