@@ -23,7 +23,7 @@ MAGMA = colormaps["magma"].with_extremes(bad="0.6")
 OUTLINE = [withStroke(linewidth=3.5, foreground="white"), Normal()]  # lines stay visible on any picture
 
 
-def _checked(name, value, *shape):
+def _checked(name, value, *shape, low=-np.inf, high=np.inf):
     """`value` as a float array of this shape (None: any size) or a ValueError that says what is wrong."""
     value = np.asarray(value, float)
     if len(shape) != value.ndim or any(want not in (None, got) for want, got in zip(shape, value.shape)):
@@ -31,6 +31,8 @@ def _checked(name, value, *shape):
         raise ValueError(f"{name}: expected shape ({expected}), got {value.shape}")
     if not np.isfinite(value).all():
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+    if not ((value >= low) & (value <= high)).all():
+        raise ValueError(f"{name}: expected numbers in [{low}, {high}], got {value.min():g} to {value.max():g}")
     return value
 
 
@@ -95,6 +97,7 @@ def _arena_panel(axes, title):
     axes.set_xlabel("x [m]", fontsize=10)
     axes.set_ylabel("y [m]", fontsize=10)
     axes.tick_params(labelsize=9)
+    axes.locator_params(nbins=6)
 
 
 def _blend(image, weights):
@@ -116,9 +119,9 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
         moved = np.linalg.norm(flow, axis=1) > SHOWN
         inside += [*points[moved, :2], *(points + flow)[moved, :2]]
         axes.quiver(*points[moved, :2].T, *flow[moved, :2].T, color=colour, angles="xy", scale_units="xy", scale=1,
-                    units="inches", width=width, headwidth=0.075 / width, headlength=0.09 / width,
-                    headaxislength=0.08 / width, zorder=4)
-        handles.append(Line2D([], [], color=colour, linewidth=72 * width, label=f"{label}\n({moved.sum()} points)"))
+                    units="inches", width=width, headwidth=0.06 / width, headlength=0.07 / width,
+                    headaxislength=0.06 / width, zorder=4)
+        handles.append(Line2D([], [], color=colour, linewidth=100 * width, label=f"{label}\n({moved.sum()} points)"))
     _arrow(axes, start, target)
     handles.append(Line2D([], [], color=POKE, linewidth=2, label="poke"))
     inside = np.clip(inside, -0.6 * arena, 0.6 * arena)  # a wild prediction may leave the view
@@ -127,6 +130,63 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     axes.set(aspect="equal", xlim=(centre[0] - half[0], centre[0] + half[0]),
              ylim=(centre[1] - half[1], centre[1] + half[1]))
     axes.legend(handles=handles, fontsize=10, loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
+
+
+def _draw_flows(panels, flows):
+    """Optical flows on one scale, so that their colours compare; the wheel and its rim's length on the first."""
+    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for *_, flow in flows))  # px
+    for label, title, flow in flows:
+        _show(panels[label], flow_to_rgb(flow, scale), title)
+    axes = panels[flows[0][0]]
+    wheel = axes.inset_axes((0.74, 0.68, 0.24, 0.30))
+    wheel.imshow(colour_wheel(64))
+    wheel.axis("off")
+    axes.text(0.72, 0.97, f"rim:\n{scale:.1f} px", fontsize=9, ha="right", va="top", transform=axes.transAxes)
+
+
+def _draw_error(figure, axes, image, warped, flow, valid):
+    """The photometric error of each pixel; grey where the flow leaves the picture or there is no depth."""
+    (height, width), margin = valid.shape, 0.01  # px: rounding alone carries no pixel of the rim out of view
+    v, u = np.mgrid[:height, :width]
+    x, y = u + flow[..., 0], v + flow[..., 1]
+    counted = valid & (x > -margin) & (x < width - 1 + margin) & (y > -margin) & (y < height - 1 + margin)
+    error = np.abs(image - warped).sum(axis=-1)  # Eq. (3) before the sum over pixels
+    shown = _show(axes, np.ma.array(error, mask=~counted), "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\n"
+                  "grey: not counted", cmap=MAGMA, vmin=0, vmax=max(0.1, (error * counted).max()))
+    _colour_bar(figure, shown, axes, "sum over R, G, B", location="bottom", shrink=0.8)
+
+
+def _draw_distances(figure, panels, maps):
+    """Both distance maps, (H, W) m^2, as distances in cm on one scale."""
+    titles = ("Distance predicted to observed\n$D_{\\hat P \\to P}$ (Eq. 2)",
+              "Distance observed to predicted\n$D_{P \\to \\hat P}$ (Eq. 2)")
+    distances = [100 * np.sqrt(squared) for squared in maps]
+    top = max(0.1, *(distance.max() for distance in distances))
+    for axes, title, distance in zip(panels, titles, distances):
+        shown = _show(axes, distance, title, cmap="viridis", vmin=0, vmax=top)
+    _colour_bar(figure, shown, panels, "square root of D, cm", location="bottom", shrink=0.8)
+
+
+def _draw_heatmap(figure, axes, heatmap, which, symbol, true, arena):
+    """A heat-map over the arena's cells, and the true place in it."""
+    _arena_panel(axes, f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)")
+    half = arena / 2
+    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
+                        extent=(-half, half, -half, half))
+    axes.plot(*true, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
+              label=f"true {which}")
+    axes.legend(fontsize=9, loc="upper right", framealpha=0.85)
+    _colour_bar(figure, shown, axes, "probability")
+
+
+def _layout(images):
+    """An empty figure: image panels in two rows, the three arena panels below -> Figure, {label: Axes}."""
+    figure = Figure(figsize=(14, 8.5), dpi=100, layout="constrained")
+    upper, lower = figure.add_gridspec(2, 1, height_ratios=(1.7, 1))
+    columns = -(-len(images) // 2)
+    cells = [*upper.subgridspec(2, columns)][:len(images)] + [*lower.subgridspec(1, 3, width_ratios=(1.7, 1, 1))]
+    labels = [*images, "scene_flow", "start", "end"]
+    return figure, {label: figure.add_subplot(cell, label=label) for label, cell in zip(labels, cells)}
 
 
 # --- figures -----------------------------------------------------------------------------------------------
@@ -145,85 +205,54 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
     Optional: valid (H, W) bool, pixels with depth (default all); the flow and the photometric error of others
     are left out. true_scene_flow (H, W, 3) m, true_optical_flow (H, W, 2) px. true_labels (H, W) int: 0, or
     the number of the object that moved there. title: replaces the one that tells the poke.
-    Raises ValueError naming the argument for a wrong shape or a number that is not finite.
+    Each panel's Axes carry their name as label. A mask's colour is its place in PALETTE.
+    Raises ValueError naming the argument for a wrong shape, a number that is not finite or out of its range.
     """
-    image = _checked("image", image, None, None, 3)
+    image = _checked("image", image, None, None, 3, low=0, high=1)
     size = image.shape[:2]
-    next_image, warped = _checked("next_image", next_image, *size, 3), _checked("warped", warped, *size, 3)
+    next_image = _checked("next_image", next_image, *size, 3, low=0, high=1)
+    warped = _checked("warped", warped, *size, 3)
     points, scene_flow = _checked("points", points, *size, 3), _checked("scene_flow", scene_flow, *size, 3)
     masks, optical_flow = _checked("masks", masks, *size, None), _checked("optical_flow", optical_flow, *size, 2)
-    distances = [100 * np.sqrt(_checked(name, value, *size)) for name, value in
-                 (("distance_predicted", distance_predicted), ("distance_observed", distance_observed))]
-    heatmaps = _checked("start_heatmap", start_heatmap, None, None), _checked("end_heatmap", end_heatmap, None, None)
+    maps = [_checked("distance_predicted", distance_predicted, *size, low=0),
+            _checked("distance_observed", distance_observed, *size, low=0)]
+    start_heatmap = _checked("start_heatmap", start_heatmap, None, None, low=0)
+    end_heatmap = _checked("end_heatmap", end_heatmap, None, None, low=0)
     poke, start = _checked("poke", poke, 3), _checked("start", start, 2)
     poke_pixels = _checked("poke_pixels", poke_pixels, 2, 2)
     if not (np.isfinite(arena) and arena > 0):
         raise ValueError(f"arena: expected a finite number of metres > 0, got {arena}")
     valid = np.ones(size, bool) if valid is None else _checked("valid", valid, *size) > 0
+
     flows = [("flow", "Predicted optical flow\n(U, V), Sec. III-C", optical_flow * valid[..., None])]
     arrows = [(scene_flow[valid], PREDICTED, 0.013, "predicted")]
     if true_optical_flow is not None:
-        true_optical_flow = _checked("true_optical_flow", true_optical_flow, *size, 2) * valid[..., None]
-        flows.append(("true_flow", "True optical flow\n(same colours)", true_optical_flow))
+        true_optical_flow = _checked("true_optical_flow", true_optical_flow, *size, 2)
+        flows.append(("true_flow", "True optical flow\n(same colours)", true_optical_flow * valid[..., None]))
     if true_scene_flow is not None:  # drawn first and wider, so that both are seen where they agree
-        arrows.insert(0, (_checked("true_scene_flow", true_scene_flow, *size, 3)[valid], TRUE, 0.03, "true"))
+        arrows.insert(0, (_checked("true_scene_flow", true_scene_flow, *size, 3)[valid], TRUE, 0.026, "true"))
 
-    labels = ["before", "masks", *(["labels"] if true_labels is not None else []), *(name for name, *_ in flows),
-              "after", "warped", "error", "distance_predicted", "distance_observed"]
-    figure = Figure(figsize=(14, 8.5), dpi=100, layout="constrained")
-    upper, lower = figure.add_gridspec(2, 1, height_ratios=(1.7, 1))
-    columns = -(-len(labels) // 2)
-    grid = upper.subgridspec(2, columns)
-    panels = {label: figure.add_subplot(grid[i // columns, i % columns], label=label)
-              for i, label in enumerate(labels)}
-    for cell, label in zip(lower.subgridspec(1, 3, width_ratios=(1.7, 1, 1)), ("scene_flow", "start", "end")):
-        panels[label] = figure.add_subplot(cell, label=label)
+    figure, panels = _layout(["before", "masks", *(["labels"] if true_labels is not None else []),
+                              *(label for label, *_ in flows), "after", "warped", "error", "distance_predicted",
+                              "distance_observed"])
     figure.suptitle(title or f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0",
                     fontsize=13)
-
     _show(panels["before"], image, "Before: image $I_t$\nand the poke $u_t$")
     _arrow(panels["before"], *poke_pixels)
     _show(panels["after"], next_image, "After: image $I_{t+1}$")
-    _show(panels["masks"], _blend(image, masks[..., 1:]), "Predicted masks $m_t^k$, a colour each\n(Eq. 1)")
+    _show(panels["masks"], _blend(image, masks[..., 1:]), "Predicted masks $m_t^k$ (Eq. 1)\na colour each")
     if true_labels is not None:
-        true_labels = _checked("true_labels", true_labels, *size).astype(int)
-        moved = true_labels[..., None] == np.arange(1, true_labels.max() + 1)
+        true_labels = _checked("true_labels", true_labels, *size, low=0)
+        moved = true_labels[..., None] == np.arange(1, int(true_labels.max()) + 1)
         _show(panels["labels"], _blend(image, moved.astype(float)), "True objects that moved\n(colours of their own)")
-
-    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for *_, flow in flows))
-    for label, text, flow in flows:
-        _show(panels[label], flow_to_rgb(flow, scale), text)
-    wheel = panels["flow"].inset_axes((0.74, 0.68, 0.24, 0.30))
-    wheel.imshow(colour_wheel(64))
-    wheel.axis("off")
-    panels["flow"].text(0.72, 0.97, f"rim:\n{scale:.1f} px", fontsize=9, ha="right", va="top",
-                        transform=panels["flow"].transAxes)
-
+    _draw_flows(panels, flows)
     _show(panels["warped"], np.clip(warped, 0, 1), "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
-    v, u = np.mgrid[:size[0], :size[1]]
-    x, y = u + optical_flow[..., 0], v + optical_flow[..., 1]
-    margin = 0.01  # px: rounding carries no pixel of the rim out of view
-    seen = (x > -margin) & (x < size[1] - 1 + margin) & (y > -margin) & (y < size[0] - 1 + margin) & valid
-    error = np.ma.array(np.abs(image - warped).sum(axis=-1), mask=~seen)  # Eq. (3), before the sum over pixels
-    shown = _show(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted", cmap=MAGMA, vmin=0)
-    _colour_bar(figure, shown, panels["error"], "sum over R, G, B", location="bottom", shrink=0.8)
-    top = max(0.1, *(distance.max() for distance in distances))
-    names = ("predicted to observed\n$D_{\\hat P \\to P}$", "observed to predicted\n$D_{P \\to \\hat P}$")
-    for label, name, distance in zip(labels[-2:], names, distances):
-        shown = _show(panels[label], distance, f"Distance {name} (Eq. 2)", cmap="viridis", vmin=0, vmax=top)
-    _colour_bar(figure, shown, [panels[label] for label in labels[-2:]], "square root of D, cm", location="bottom", shrink=0.8)
-
+    _draw_error(figure, panels["error"], image, warped, optical_flow, valid)
+    _draw_distances(figure, [panels["distance_predicted"], panels["distance_observed"]], maps)
     _arena_panel(panels["scene_flow"], "Scene flow from above (Eq. 1)")
     _draw_scene_flow(panels["scene_flow"], image[valid], points[valid], arrows, start, poke[:2], arena)
-    for label, heatmap, symbol, where in zip(("start", "end"), heatmaps, ("A", "B"), (start, poke[:2])):
-        _arena_panel(panels[label], f"Inverse model: {label} $\\hat {symbol}_t$ (Sec. III-E)")
-        half = arena / 2
-        shown = panels[label].imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
-                                     extent=(-half, half, -half, half))
-        panels[label].plot(*where, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2,
-                           path_effects=OUTLINE, label=f"true {label}")
-        panels[label].legend(fontsize=9, loc="upper right", framealpha=0.85)
-        _colour_bar(figure, shown, panels[label], "probability")
+    _draw_heatmap(figure, panels["start"], start_heatmap, "start", "A", start, arena)
+    _draw_heatmap(figure, panels["end"], end_heatmap, "end", "B", poke[:2], arena)
     return figure
 
 

@@ -12,7 +12,7 @@ import numpy as onp
 from .ops import take
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # the pose is an array: it has no one-word equality
 class Camera:
     """A fixed pinhole camera without lens distortion.
 
@@ -29,8 +29,8 @@ class Camera:
     arena_from_camera: onp.ndarray
 
     def __post_init__(self):
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera: expected a positive image size, got {self.width} x {self.height}")
+        if not all(isinstance(size, (int, onp.integer)) and size >= 1 for size in (self.width, self.height)):
+            raise ValueError(f"camera: expected a positive whole image size, got {self.width} x {self.height}")
         intrinsics = onp.array([self.fx, self.fy, self.cx, self.cy], float)
         if not onp.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"camera: expected finite intrinsics with fx, fy > 0, got {intrinsics.tolist()}")
@@ -38,8 +38,8 @@ class Camera:
         if pose.shape != (4, 4):
             raise ValueError(f"camera: arena_from_camera must be (4, 4), got {pose.shape}")
         rotation = pose[:3, :3]
-        if not (onp.allclose(rotation @ rotation.T, onp.eye(3), atol=1e-5) and onp.linalg.det(rotation) > 0
-                and onp.isfinite(pose).all() and onp.allclose(pose[3], [0, 0, 0, 1])):
+        if not (onp.isfinite(pose).all() and onp.allclose(rotation @ rotation.T, onp.eye(3), atol=1e-5)
+                and onp.linalg.det(rotation) > 0 and onp.allclose(pose[3], [0, 0, 0, 1])):
             raise ValueError("camera: arena_from_camera is not a rigid transform (rotation and translation)")
         object.__setattr__(self, "arena_from_camera", pose)
 
@@ -50,7 +50,7 @@ class Camera:
 
     @property
     def is_mirror_symmetric(self):
-        """True when the image flipped left-right shows the arena mirrored at its plane x = 0."""
+        """True when the image flipped left-right shows the arena mirrored at its plane x = 0, seen from y < 0."""
         right, position = self.arena_from_camera[:3, 0], self.arena_from_camera[:3, 3]
         return bool(onp.allclose(right, [1, 0, 0], atol=1e-6) and abs(position[0]) < 1e-6
                     and abs(self.cx - (self.width - 1) / 2) < 1e-6)
@@ -60,11 +60,14 @@ def look_at(eye, target):
     """Camera pose (4, 4) arena_from_camera at `eye`, looking at `target` (both (3,), m, arena), z up.
 
     Not in the paper: it only says that the camera is fixed.
+    Raises ValueError when it would look straight up or down, where "right" is not defined.
     """
     eye, target = onp.asarray(eye, float), onp.asarray(target, float)
-    forward = (target - eye) / onp.linalg.norm(target - eye)
+    forward = target - eye
     right = onp.cross(forward, [0.0, 0.0, 1.0])
-    right /= onp.linalg.norm(right)
+    if not onp.linalg.norm(right) > 1e-9:
+        raise ValueError(f"eye, target: expected two points not one above the other, got {eye}, {target}")
+    forward, right = forward / onp.linalg.norm(forward), right / onp.linalg.norm(right)
     pose = onp.eye(4)
     pose[:3] = onp.stack([right, onp.cross(forward, right), forward, eye], axis=1)
     return pose
@@ -83,7 +86,10 @@ def unproject(depth, camera):
     X = (u - cx) Z / fx,  Y = (v - cy) Z / fy, then arena_from_camera.
     depth (..., H, W) m along the optical axis -> points (..., H, W, 3) m. Pixels without depth (0)
     become points at the camera: carry `depth > 0` along as the validity mask.
+    Raises ValueError for another picture size and for whole-number depth (convert it to metres first).
     """
+    if not onp.issubdtype(depth.dtype, onp.floating):
+        raise ValueError(f"depth: expected floating-point metres, got {depth.dtype}")
     if depth.shape[-2:] != (camera.height, camera.width):
         raise ValueError(f"depth: expected (..., {camera.height}, {camera.width}) as the camera says, "
                          f"got {depth.shape}")
@@ -154,7 +160,7 @@ def transform_layer(points, masks, rotations, translations):
     sum_k m_k (R_k P + T_k) = (sum_k m_k R_k) P + sum_k m_k T_k.
     """
     batch, count = points.shape[0], masks.shape[-1]
-    if points.ndim != 3 or masks.shape[:2] != points.shape[:2] or rotations.shape != (batch, count, 3, 3) \
+    if points.ndim != 3 or masks.shape != points.shape[:2] + (count,) or rotations.shape != (batch, count, 3, 3) \
             or translations.shape != (batch, count, 3):
         raise ValueError("transform_layer: expected points (B, N, 3), masks (B, N, K), rotations (B, K, 3, 3), "
                          f"translations (B, K, 3), got {points.shape}, {masks.shape}, {rotations.shape}, "

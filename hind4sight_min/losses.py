@@ -69,35 +69,38 @@ def edge_weights(images):
     return onp.exp(-EDGE_SHARPNESS * across), onp.exp(-EDGE_SHARPNESS * down)
 
 
-def edge_aware_smoothness(field, images):
+def edge_aware_smoothness(field, images, valid):
     """sum_xy |d field/dx| e^{-|dI/dx|} + |d field/dy| e^{-|dI/dy|}: the common form of Eq. (4) and (5).
 
-    field (B, H, W, C); images (B, H, W, 3) on the same grid, in [0, 1] -> (B,), units of the field.
+    field (B, H, W, C); images (B, H, W, 3) on the same grid, in [0, 1]; valid (B, N) bool -> (B,), units of the
+    field. A step counts where both neighbours have depth.
     """
     across, down = edge_weights(images)
+    valid = onp.reshape(valid, images.shape[:3])
+    across, down = across * (valid[:, :, 1:] & valid[:, :, :-1]), down * (valid[:, 1:] & valid[:, :-1])
     every, after, before = slice(None), slice(1, None), slice(None, -1)
     dx = np.abs(take(field, (every, every, after)) - take(field, (every, every, before)))
     dy = np.abs(take(field, (every, after)) - take(field, (every, before)))
     return np.sum(dx * across[..., None], axis=(1, 2, 3)) + np.sum(dy * down[..., None], axis=(1, 2, 3))
 
 
-def flow_smoothness_loss(flow, images):
+def flow_smoothness_loss(flow, images, valid):
     """Paper: Eq. (4), Sec. III-D.  L_fs = sum |grad U| e^{-|grad I_t|} + |grad V| e^{-|grad I_t|}.
 
-    flow (B, H, W, 2) px; images (B, H, W, 3) -> (B,) px.
+    flow (B, H, W, 2) px; images (B, H, W, 3); valid (B, N) bool -> (B,) px.
     """
-    return edge_aware_smoothness(flow, images)  # Eq. (4)
+    return edge_aware_smoothness(flow, images, valid)  # Eq. (4)
 
 
-def distance_smoothness_loss(map_predicted, map_observed, images, next_images):
+def distance_smoothness_loss(map_predicted, map_observed, images, next_images, valid, next_valid):
     """Paper: Eq. (5), Sec. III-D.  L_ds = sum |grad D_{P->P'}| e^{-|grad I|} + |grad D_{P'->P}| e^{-|grad I|}.
 
     The paper prints I_{t+1} for both; D_{P'->P} lives on frame t's grid, so it is weighted by I_t here.
-    Two maps (B, N) m^2, two images (B, H, W, 3) -> (B,) m^2.
+    Two maps (B, N) m^2, two images (B, H, W, 3), two masks (B, N) bool -> (B,) m^2.
     """
     grid = images.shape[:3] + (1,)
-    return (edge_aware_smoothness(np.reshape(map_observed, grid), next_images)
-            + edge_aware_smoothness(np.reshape(map_predicted, grid), images))  # Eq. (5)
+    return (edge_aware_smoothness(np.reshape(map_observed, grid), next_images, next_valid)
+            + edge_aware_smoothness(np.reshape(map_predicted, grid), images, valid))  # Eq. (5)
 
 
 # --- the inverse model -----------------------------------------------------------------------------------
@@ -117,7 +120,8 @@ def embedding_loss(predicted, observed):
 
     (B, E), (B, E) -> (B,), the mean over E, so that its weight does not depend on the embedding's width.
     """
-    return np.mean(np.abs(predicted - observed), axis=1)
+    # Not np.mean: under NumPy 2 autograd's derivative of it turns float32 into float64.
+    return np.sum(np.abs(predicted - observed), axis=1) / float(predicted.shape[1])
 
 
 def inverse_loss(start_logits, end_logits, start_cells, end_cells, predicted_embedding, next_embedding):
@@ -141,4 +145,5 @@ def full_loss(terms, weights):
     """
     if set(terms) != set(weights):
         raise ValueError(f"weights: expected the keys {sorted(terms)}, got {sorted(weights)}")
-    return np.mean(sum(weights[name] * terms[name] for name in terms))  # Eq. (6)
+    total = sum(weights[name] * terms[name] for name in terms)  # Eq. (6)
+    return np.sum(total) / float(len(total))

@@ -78,7 +78,7 @@ def pooling_weights(local, valid):
     """
     x, y, z = local[..., 0], local[..., 1], local[..., 2]
     near = onp.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
-    path = onp.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.18) & (x < 0.02))
+    path = onp.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
     weights = onp.stack([near, path], axis=1) * (valid & (z > 0.005))[:, None]
     return weights / (weights.sum(axis=2, keepdims=True) + 1e-6)
 

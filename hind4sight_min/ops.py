@@ -78,8 +78,8 @@ def bilinear_sample(images, positions):
     cv2.remap does it; OpenCV 4 rounds positions to 1/32 px, OpenCV 5 only for float64 images.
     Raises ValueError for other shapes or positions that are not finite (OpenCV would silently read 0).
     """
-    if images.ndim != 4 or positions.ndim != 3 or positions.shape[::2] != (len(images), 2):
-        raise ValueError("images, positions: expected (B, H, W, C) and (B, N, 2), "
+    if images.ndim != 4 or positions.ndim != 3 or positions.shape[::2] != (len(images), 2) or not positions.size:
+        raise ValueError("images, positions: expected (B, H, W, C) and (B, N, 2) with N >= 1, "
                          f"got {images.shape}, {positions.shape}")
     if not np.isfinite(positions).all():
         raise ValueError("positions: expected finite pixels, got NaN or infinity")

@@ -31,15 +31,15 @@ class Settings:
     `place_within` is the part of the arena in which a new scene's objects are put down.
     """
     objects_min: int = 3
-    objects_max: int = 5
+    objects_max: int = 4
     kinds: tuple = ("carton", "can", "bracket", "pot")
     textures: tuple = ("stripes", "checks", "dots", "patches")
     arena: float = 0.5
     cell: float = 0.025
     wall_height: float = 0.03
-    place_within: float = 0.6
+    place_within: float = 0.7
     pokes_per_scene: int = 6
-    poke_length: tuple = (0.14, 0.18)
+    poke_length: tuple = (0.10, 0.14)
     finger_radius: float = 0.01
     finger_force: float = 25.0
     finger_speed: float = 0.25

@@ -69,9 +69,10 @@ def loss_terms(params, sizes, batch, camera):
                              next_features, batch.cells)
     return {
         "chamfer": losses.chamfer_loss(*maps),
-        "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images),
+        "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
+                                                               batch.valid, batch.next_valid),
         "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.valid),
-        "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images),
+        "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
         "inverse": losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells,
                                        prediction.embedding, next_state),
     }
@@ -204,7 +205,7 @@ def rows_of_step(recipe, count, step):
     return onp.concatenate(rows), rng.random(recipe.batch) < (0.5 if recipe.mirror else 0.0), rng
 
 
-CHUNK = 4  # interactions per thread and gradient: enough to hide autograd's overhead, few enough to stay small
+CHUNK = 8  # interactions per thread and gradient: enough of them to hide autograd's overhead per operation
 
 
 def train(interactions, run, threads=2, on_epoch=None, on_step=None):

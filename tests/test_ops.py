@@ -96,7 +96,8 @@ def test_the_clouds_of_a_batch_do_not_see_each_other():
 
 @pytest.mark.parametrize("queries, references, valid", [
     ((5, 3), (2, 4, 3), (2, 4)), ((2, 5, 3), (4, 3), (2, 4)), ((2, 5, 3), (3, 4, 3), (3, 4)),
-    ((2, 5, 3), (2, 4, 2), (2, 4)), ((2, 5, 3), (2, 4, 3), (2, 5)), ((2, 5, 3), (2, 4, 3), (2, 4, 1))])
+    ((2, 5, 3), (2, 4, 2), (2, 4)), ((2, 5, 3), (2, 4, 3), (2, 5)), ((2, 5, 3), (2, 4, 3), (2, 4, 1)),
+    ((2, 5), (2, 4), (2, 4)), ((2, 5, 3, 1), (2, 4, 3), (2, 4)), ((2, 5, 3), (2, 4, 3, 1), (2, 4))])
 def test_nearest_squared_distances_refuse_other_shapes(queries, references, valid):
     with pytest.raises(ValueError, match="queries, references, valid"):
         nearest_squared_distances(np.ones(queries), np.ones(references), np.ones(valid, bool))

@@ -1,0 +1,111 @@
+"""Recorded results: run a command, keep its figures with where they came from, and put them into the README.
+
+    python docs/results.py record shipped -- hind4sight evaluate
+    python docs/results.py summary
+
+`record NAME -- COMMAND` runs COMMAND with `--json` added and writes docs/results/NAME.json: the figures, the
+command, commit, versions, machine and duration. `summary` gathers the headline figures of all recorded results
+in docs/results/summary.json and writes the README's table from them; a test fails while the README says
+anything else.
+"""
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from hind4sight_min.__main__ import write_text
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"
+BEGIN, END = "<!-- figures: written by docs/results.py from docs/results/summary.json -->", "<!-- /figures -->"
+
+# headline figure -> (recorded result, its name there, what the README says, format, goal)
+HEADLINES = {
+    "demo_flow_mse_ratio": ("demo", "demo_flow_mse_ratio", "demo: squared flow error / no motion", "{:.3f}", "<= 0.35"),
+    "demo_still_epe_cm": ("demo", "demo_still_epe_cm", "demo: drift of still points, cm", "{:.3f}", "< 0.15"),
+    "demo_mask_iou": ("demo", "demo_mask_iou", "demo: IoU of moved objects and masks", "{:.2f}", ""),
+    "demo_seconds": ("demo", "demo_seconds", "demo: seconds, all in all", "{:.0f}", "< 300"),
+    "shipped_flow_mse_ratio": ("shipped", "flow_mse_ratio", "shipped model: squared flow error / no motion",
+                               "{:.3f}", "<= 0.20"),
+    "shipped_flow_epe_cm": ("shipped", "flow_epe_cm", "shipped model: error of moving points, cm", "{:.2f}", ""),
+    "shipped_still_epe_cm": ("shipped", "still_epe_cm", "shipped model: drift of still points, cm", "{:.3f}", ""),
+    "shipped_mask_iou": ("shipped", "mask_iou", "shipped model: IoU of moved objects and masks", "{:.2f}", ""),
+    "shipped_optical_epe_px": ("shipped", "optical_epe_px", "shipped model: optical flow error, moving, px",
+                               "{:.2f}", ""),
+    "shipped_inverse_target_cm": ("shipped", "inverse_target_cm", "shipped model: median target error, cm",
+                                  "{:.1f}", "< 3"),
+    "shipped_inverse_direction_deg": ("shipped", "inverse_direction_deg", "shipped model: median direction error, deg",
+                                      "{:.1f}", "< 30"),
+    "collect_share_in_bullet": ("collection", "collect_share_in_bullet", "collection: share of time inside Bullet",
+                                "{:.2f}", ">= 0.80"),
+    "collect_jobs2_speedup": ("collection", "collect_jobs2_speedup", "collection: two processes against one",
+                              "{:.2f}", ">= 1.7"),
+}
+
+
+def record(name, command):
+    """Run a command and write its figures and their provenance to docs/results/NAME.json."""
+    git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=ROOT, capture_output=True,
+                         text=True, check=True)
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "figures.json"
+        subprocess.run([*command, "--json", str(path)], check=True)
+        figures = json.loads(path.read_text())
+    libraries = {}
+    for library in ("numpy", "scipy", "opencv-python-headless", "autograd", "pybullet"):
+        try:
+            libraries[library] = version(library)
+        except ModuleNotFoundError:
+            libraries[library] = None
+    result = {"figures": figures, "command": " ".join(command), "commit": git.stdout.strip(),
+              "seconds": round(time.perf_counter() - start, 1), "date": time.strftime("%Y-%m-%d"),
+              "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
+              "python": platform.python_version(), "versions": libraries}
+    write_text(RESULTS / f"{name}.json", json.dumps(result, indent=2, sort_keys=True) + "\n")
+
+
+def gather():
+    """The headline figures that have been recorded -> flat dict."""
+    found = {}
+    for headline, (name, figure, *_) in HEADLINES.items():
+        path = RESULTS / f"{name}.json"
+        if path.exists():
+            found[headline] = json.loads(path.read_text())["figures"][figure]
+    return found
+
+
+def table(summary):
+    """The README's table of the headline figures."""
+    lines = ["| figure | measured | goal |", "|---|---|---|"]
+    for name, (_, _, text, form, goal) in HEADLINES.items():
+        if name in summary:
+            lines.append(f"| {text} | {form.format(summary[name])} | {goal.replace('<=', '&le;').replace('>=', '&ge;')} |")
+    return "\n".join(lines)
+
+
+def readme_with(text, summary):
+    """The README's text with its table replaced."""
+    before, rest = text.split(BEGIN)
+    _, after = rest.split(END)
+    return f"{before}{BEGIN}\n{table(summary)}\n{END}{after}"
+
+
+def main(arguments):
+    if arguments[:1] == ["record"] and len(arguments) > 3 and arguments[2] == "--":
+        record(arguments[1], arguments[3:])
+    elif arguments == ["summary"]:
+        summary = gather()
+        write_text(RESULTS / "summary.json", json.dumps(summary, indent=2, sort_keys=True) + "\n")
+        write_text(README, readme_with(README.read_text(), summary))
+    else:
+        sys.exit(__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
