@@ -4,7 +4,6 @@ import json
 import os
 import sys
 import sysconfig
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from . import evaluation, figures, simulator, training
 from .geometry import project
-from .interactions import load_interactions, load_truth
+from .interactions import load_interactions, load_truth, whole_file
 from .losses import distance_maps, warp_backward
 from .networks import Sizes
 
@@ -41,17 +40,8 @@ def progress_line(label):
 
 def write_text(path, text):
     """Write a text file, whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with whole_file(path) as temporary:
+        temporary.write_text(text)
 
 
 def write_json(path, figures):
@@ -103,14 +93,17 @@ def show_row(run, interactions, row, truth=None):
     extra = {}
     if truth is not None:
         true = evaluation.true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
-        extra = {"true_scene_flow": true, "true_optical_flow": evaluation.optical_flow(points, points + true, camera)}
+        labels = truth.labels[row]
+        moved = np.unique(labels[np.linalg.norm(true, axis=2) > evaluation.MOVING])
+        extra = {"true_scene_flow": true, "true_optical_flow": evaluation.optical_flow(points, points + true, camera),
+                 "true_labels": np.where(np.isin(labels, moved), labels, 0)}
     return figures.interaction_figure(
         image=batch.images[0], next_image=batch.next_images[0], points=points,
         scene_flow=prediction.points[0].reshape(*shape, 3) - points, masks=prediction.masks[0].reshape(*shape, -1),
         optical_flow=flow[0], warped=warped[0], distance_predicted=maps[0][0].reshape(shape),
         distance_observed=maps[1][0].reshape(shape), start_heatmap=start_heatmap.reshape(interactions.grid_shape),
         end_heatmap=end_heatmap.reshape(interactions.grid_shape), arena=settings["arena"], poke=poke, start=start,
-        poke_pixels=project(ends, camera), **extra)
+        poke_pixels=project(ends, camera), valid=batch.valid[0].reshape(shape), **extra)
 
 
 # --- commands ----------------------------------------------------------------------------------------------
@@ -141,12 +134,12 @@ def run_train(args):
         recipe = training.Recipe(steps=args.steps, batch=args.batch, learning_rate=args.learning_rate, seed=args.seed,
                                  depth_noise=args.depth_noise, sizes=Sizes(masks=args.masks, width=args.width))
         run = training.start_run(recipe, interactions)
-    seconds = train_and_save(run, interactions, args.out, args.threads)
+    seconds = train_and_save(run, interactions, args.out, args.jobs)
     print(f"{args.out}: {run.step} steps, {seconds:.0f} s in all")
     write_json(args.json, {"train_seconds": seconds, **{f"loss_{k}": v for k, v in run.log[-1].items()}})
 
 
-def train_and_save(run, interactions, path, threads, save_every=60.0):
+def train_and_save(run, interactions, path, jobs, save_every=60.0):
     """Train to the recipe's end; a checkpoint every minute and a log line and CSV row every epoch."""
     path = Path(path)
     show, before, start = progress_line("train"), run.meta.get("seconds", 0.0), time.perf_counter()
@@ -169,7 +162,7 @@ def train_and_save(run, interactions, path, threads, save_every=60.0):
               + ", ".join(f"{name} {entry[name]:.4g}" for name in run.recipe.weights), flush=True)
         write_log(path.with_suffix(".csv"), run.log)
 
-    training.train(interactions, run, threads, on_epoch=on_epoch, on_step=on_step)
+    training.train(interactions, run, jobs, on_epoch=on_epoch, on_step=on_step)
     save()
     return run.meta["seconds"]
 
@@ -212,7 +205,7 @@ def run_demo(args):
     print("2. Train on them without labels: Chamfer, photometric, smoothness and inverse losses (Eq. 6).")
     interactions = load_interactions(out / "train")
     run = training.start_run(replace(DEMO_RECIPE, seed=args.seed), interactions)
-    train_and_save(run, interactions, out / "checkpoint.npz", threads=args.jobs)
+    train_and_save(run, interactions, out / "checkpoint.npz", args.jobs)
     print("3. Evaluate on pokes that were never trained on.")
     test, truth = load_interactions(out / "test"), load_truth(out / "test")
     metrics = evaluation.evaluate(run, test, truth, progress_line("evaluate"))
@@ -266,7 +259,7 @@ def build_parser():
     sub.add_argument("--masks", type=int, default=Sizes.masks, help="K, background included")
     sub.add_argument("--width", type=int, default=Sizes.width, help="units per layer of the forward model")
     sub.add_argument("--seed", type=int, default=0)
-    sub.add_argument("--threads", type=int, default=os.cpu_count(), help="the result does not depend on it")
+    sub.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (the result does not depend on it)")
     sub.add_argument("--resume", action="store_true", help="go on with the checkpoint OUT")
     sub.add_argument("--json", help="write the figures here too")
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.patheffects import Normal, withStroke
+from matplotlib.ticker import LogFormatter
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart: one per mask (or object).
 PALETTE = np.array([(230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178),
@@ -172,7 +173,7 @@ def _draw_heatmap(figure, axes, heatmap, which, symbol, true, arena):
     _arena_panel(axes, f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)")
     half = arena / 2
     shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
-                        extent=(-half, half, -half, half))
+                        vmax=heatmap.max() or 1, extent=(-half, half, -half, half))
     axes.plot(*true, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
               label=f"true {which}")
     axes.legend(fontsize=9, loc="upper right", framealpha=0.85)
@@ -283,6 +284,8 @@ def training_figure(log):
         axes.plot(values["step"], values[name], ".-", color=PREDICTED, markersize=5, linewidth=1.5)
         if (values[name] > 0).all():
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(LogFormatter())  # 2e-02, and 20: shorter than powers of ten
+            axes.yaxis.set_minor_formatter(LogFormatter())
         axes.set_title(f"{name.replace('_', ' ')}\n{TERMS.get(name, '')}".strip(), fontsize=11)
         axes.set_xlabel("step", fontsize=10)
         axes.tick_params(labelsize=9, which="both")
@@ -291,14 +294,18 @@ def training_figure(log):
 
 
 def save_figure(figure, path):
-    """Write a figure as PNG, whole or not at all; the same figure made twice gives the same bytes.
+    """Write a figure as PNG, whole or not at all; the same figure gives the same bytes, however often.
 
+    Not in the paper. The figure's layout stays as saved: a second pass would move panels by a hair.
     Raises ValueError for a path that does not end in .png.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name ending in .png, got {path.name!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
+    if figure.get_layout_engine():
+        figure.get_layout_engine().execute(figure)
+        figure.set_layout_engine("none")
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         figure.savefig(temporary, format="png", dpi="figure", metadata={"Software": None})

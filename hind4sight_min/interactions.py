@@ -6,8 +6,8 @@ the robot does not see. Training reads only the former; evaluation also reads th
 """
 import json
 import os
-import tempfile
 import zipfile
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -172,18 +172,23 @@ def associate_with_noise(depth, rng, window, threshold=0.10):
 
 # --- files -------------------------------------------------------------------------------------------
 
-def save_npz(path, arrays, meta):
-    """Write arrays and one JSON text to a compressed .npz, whole or not at all."""
+@contextmanager
+def whole_file(path):
+    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, meta=np.array(json.dumps(meta, sort_keys=True)), **arrays)
+        yield temporary
         os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_npz(path, arrays, meta):
+    """Write arrays and one JSON text to a compressed .npz, whole or not at all."""
+    with whole_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, meta=np.array(json.dumps(meta, sort_keys=True)), **arrays)
 
 
 def load_npz(path, format):

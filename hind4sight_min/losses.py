@@ -42,8 +42,8 @@ def warp_backward(next_images, flow):
     batch, height, width, _ = next_images.shape
     v, u = onp.mgrid[:height, :width]
     positions = onp.stack([u, v], axis=-1).astype(getval(flow).dtype) + flow
-    where = getval(positions)
-    in_view = ((where >= 0) & (where <= [width - 1, height - 1])).all(axis=-1)
+    where, margin = getval(positions), 1e-3  # px: rounding must not carry the rim's still pixels out of view
+    in_view = ((where >= -margin) & (where <= [width - 1 + margin, height - 1 + margin])).all(axis=-1)
     warped = bilinear_sample(next_images, np.reshape(positions, (batch, -1, 2)))
     return np.reshape(warped, next_images.shape), in_view
 

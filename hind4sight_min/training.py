@@ -3,8 +3,11 @@
 Nothing here reads the simulator's truth.
 """
 import math
-from concurrent.futures import ThreadPoolExecutor
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context
 
 import autograd.numpy as np
 import numpy as onp
@@ -205,36 +208,52 @@ def rows_of_step(recipe, count, step):
     return onp.concatenate(rows), rng.random(recipe.batch) < (0.5 if recipe.mirror else 0.0), rng
 
 
-CHUNK = 8  # interactions per thread and gradient: enough of them to hide autograd's overhead per operation
+CHUNK = 8  # interactions per gradient: enough of them to hide autograd's overhead per operation
 
 
-def train(interactions, run, threads=2, on_epoch=None, on_step=None):
+def chunk_gradient(interactions, mirror, noise_seed, weights, vector, layout, recipe):
+    """`batch_gradient` of a few interactions, weighted by their share of the batch; runs in a worker process."""
+    rows, rng = onp.arange(len(interactions)), onp.random.default_rng(noise_seed)
+    batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng)
+    terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, weights)
+    share = len(rows) / recipe.batch
+    return {name: share * value for name, value in terms.items()}, onp.float32(share) * gradient
+
+
+@contextmanager
+def workers(jobs):
+    """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes.
+
+    Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
+    Fresh processes, not forks, which do not survive thread pools; so a script that trains with jobs > 1 needs
+    the usual `if __name__ == "__main__":`.
+    """
+    if jobs == 1:
+        yield lambda arguments: [chunk_gradient(*each) for each in arguments]
+        return
+    ignore = (signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the parent to handle
+    with ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore) as pool:
+        yield lambda arguments: [job.result() for job in [pool.submit(chunk_gradient, *each) for each in arguments]]
+
+
+def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
     """Go on with a run to its recipe's last step; updates and returns it.
 
-    on_step(run), on_epoch(run) are called after each. The gradient of a batch is the mean over chunks that
-    are computed in parallel and added in order, so the result does not depend on `threads`.
+    on_epoch(run), on_step(run) are called after each. The gradient of a batch is the sum over chunks that may
+    be computed in parallel and are added in order, so the result does not depend on `jobs`.
     Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
     """
     if interactions.meta["camera"] != run.meta["camera"]:
         raise ValueError("interactions: taken with another camera than the run's")
-    if threads < 1:
-        raise ValueError(f"threads: expected a whole number >= 1, got {threads}")
-    recipe, camera = run.recipe, interactions.camera
-    per_epoch = max(1, len(interactions) // recipe.batch)
-
-    def chunk_gradient(rows, mirror, noise_seed, weights):
-        batch = make_batch(interactions, rows, mirror, recipe.depth_noise, onp.random.default_rng(noise_seed))
-        terms, gradient = batch_gradient(run.vector, run.layout, recipe.sizes, batch, camera, weights)
-        share = len(rows) / recipe.batch
-        return {name: share * value for name, value in terms.items()}, onp.float32(share) * gradient
-
-    with ThreadPoolExecutor(threads) as pool:
+    if jobs < 1:
+        raise ValueError(f"jobs: expected a whole number >= 1, got {jobs}")
+    recipe, per_epoch = run.recipe, max(1, len(interactions) // run.recipe.batch)
+    with workers(min(jobs, -(-recipe.batch // CHUNK))) as gradients:
         while run.step < recipe.steps:
             rows, mirror, rng = rows_of_step(recipe, len(interactions), run.step)
             weights, rate = weights_at(recipe, run.step), learning_rate(recipe, run.step)
-            jobs = [pool.submit(chunk_gradient, rows[i:i + CHUNK], mirror[i:i + CHUNK], rng.integers(2 ** 32), weights)
-                    for i in range(0, recipe.batch, CHUNK)]
-            parts = [job.result() for job in jobs]
+            parts = gradients([(interactions[rows[i:i + CHUNK]], mirror[i:i + CHUNK], rng.integers(2 ** 32), weights,
+                                run.vector, run.layout, recipe) for i in range(0, recipe.batch, CHUNK)])
             gradient = sum(part[1] for part in parts)
             if not onp.isfinite(gradient).all():
                 raise FloatingPointError(f"the gradient is not finite at step {run.step}")

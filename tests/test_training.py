@@ -91,13 +91,21 @@ def test_training_lowers_the_loss_it_trains():
     assert log[-1]["inverse"] < 0.8 * log[0]["inverse"]
 
 
-def test_the_same_seed_gives_the_same_run_on_any_number_of_threads():
-    data = pokes_seen()
-    runs = [train(data, start_run(TINY, data), threads=threads) for threads in (1, 2, 3)]
-    for other in runs[1:]:
-        np.testing.assert_array_equal(other.vector, runs[0].vector)
-        assert other.log == runs[0].log
-    assert not np.array_equal(train(data, start_run(replace(TINY, seed=4), data)).vector, runs[0].vector)
+def test_the_same_seed_gives_the_same_run_on_any_number_of_processes():
+    data, recipe = pokes_seen(), replace(TINY, batch=12)  # two chunks, one larger
+    alone, together = (train(data, start_run(recipe, data), jobs=jobs) for jobs in (1, 2))
+    np.testing.assert_array_equal(together.vector, alone.vector)
+    assert together.log == alone.log
+    assert not np.array_equal(train(data, start_run(replace(recipe, seed=4), data)).vector, alone.vector)
+
+
+def test_the_gradient_of_a_batch_is_that_of_its_chunks(monkeypatch):
+    data, recipe = pokes_seen(), replace(TINY, batch=7, steps=1)
+    whole = train(data, start_run(recipe, data))
+    monkeypatch.setattr(training, "CHUNK", 3)
+    chunks = train(data, start_run(recipe, data))
+    difference = np.linalg.norm(chunks.first_moment - whole.first_moment)
+    assert difference < 1e-3 * np.linalg.norm(whole.first_moment)
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path):
@@ -242,8 +250,8 @@ def test_checkpoint_with_wrong_contents(tmp_path):
 
 def test_bad_arguments():
     data = pokes_seen()
-    with pytest.raises(ValueError, match="threads"):
-        train(data, start_run(TINY, data), threads=0)
+    with pytest.raises(ValueError, match="jobs"):
+        train(data, start_run(TINY, data), jobs=0)
     with pytest.raises(ValueError, match="camera"):
         train(pokes_seen(x=0.1), start_run(TINY, data))
     for name in ("steps", "batch", "learning_rate"):
