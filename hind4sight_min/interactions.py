@@ -6,7 +6,6 @@ the robot does not see. Training reads only the former; evaluation also reads th
 """
 import json
 import os
-import zipfile
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,6 +39,9 @@ class Interactions:
 
     def __post_init__(self):
         count, size = len(self.pokes), (self.camera.height, self.camera.width)
+        for name in ("arena", "cell"):
+            if not 0 < self.meta.get("settings", {}).get(name, 0) < float("inf"):
+                raise ValueError(f"meta: expected settings with a positive {name!r} in m")
         expected = {"rgb_before": (count, *size, 3), "rgb_after": (count, *size, 3),
                     "depth_before": (count, *size), "depth_after": (count, *size),
                     "pokes": (count, 3), "starts": (count, 2), "empty_depth": size}
@@ -137,15 +139,14 @@ def cell_centres(settings):
 def add_depth_noise(depth, rng, standard_deviation=0.01):
     """Gaussian depth noise that grows with depth. Paper: Sec. IV-B, "SD of 1 cm, scaled by the depth".
 
-    The SD is `standard_deviation` metres at the picture's median depth and proportional to depth.
+    The SD is `standard_deviation` metres at each picture's median depth, and proportional to depth.
     depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing.
     """
     if not standard_deviation >= 0:
         raise ValueError(f"standard_deviation: expected a number of metres >= 0, got {standard_deviation}")
     valid = depth > 0
-    if not valid.any():
-        return depth.copy()
-    scale = standard_deviation / np.median(depth[valid])
+    median = np.ma.median(np.ma.array(depth, mask=~valid), axis=(-2, -1), keepdims=True)
+    scale = standard_deviation / np.ma.filled(median, 1.0)
     noisy = depth * (1 + scale * rng.standard_normal(depth.shape))
     return np.where(valid, np.maximum(noisy, DEPTH_UNIT), 0).astype(depth.dtype)
 
@@ -199,13 +200,11 @@ def load_npz(path, format):
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        meta = json.loads(str(arrays.pop("meta")))
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: damaged or not one of our files ({error})") from None
-    except Exception as error:  # zlib.error has no public base class
-        if type(error).__name__ != "error":
-            raise
-        raise ValueError(f"{path}: damaged ({error})") from None
+        meta = dict(json.loads(str(arrays.pop("meta"))))
+    except MemoryError:
+        raise
+    except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, NumPy, JSON
+        raise ValueError(f"{path}: damaged or not one of our files ({error or type(error).__name__})") from None
     if meta.get("format") != format:
         raise ValueError(f"{path}: expected format {format!r}, got {meta.get('format')!r}")
     return arrays, meta
@@ -269,6 +268,15 @@ def load_interactions(folder):
 
 def load_truth(folder):
     """The truth of all shards of a folder, joined -> Truth, in the order of `load_interactions`."""
-    parts = [load_npz(truth_path(path), FORMAT)[0] for path in shards_in(folder)]
+    parts = []
+    for shard in shards_in(folder):
+        path, pictures = truth_path(shard), load_shard(shard).depth_before.shape
+        part, _ = load_npz(path, FORMAT)
+        poses = (pictures[0], 7, 7)
+        for name, shape in (("labels", pictures), ("poses_before", poses), ("poses_after", poses)):
+            found = part[name].shape if name in part else "nothing"
+            if found != shape:
+                raise ValueError(f"{path}: {name}: expected shape {shape}, got {found}")
+        parts.append(part)
     return Truth(*(np.concatenate([part[name] for part in parts])
                    for name in ("labels", "poses_before", "poses_after")))

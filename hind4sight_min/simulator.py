@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -16,7 +16,8 @@ import numpy as np
 
 from .geometry import Camera, look_at, unproject
 from .interactions import (Interactions, Truth, cell_centres, cells_of, grid_shape, load_shard,
-                           rotation_from_quaternion, save_shard)
+                           save_shard, truth_path)
+from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
 
 MAX_OBJECTS = 7
 SHARD_POKES = 100  # one shard is one Bullet world with its own seed, so the data do not depend on --jobs
@@ -47,148 +48,28 @@ class Settings:
     height: int = 48
 
     def __post_init__(self):
-        for field in fields(self):  # JSON has lists where we have tuples
-            if isinstance(getattr(self, field.name), list):
-                object.__setattr__(self, field.name, tuple(getattr(self, field.name)))
-        if not 1 <= self.objects_min <= self.objects_max <= MAX_OBJECTS:
-            raise ValueError(f"objects: expected 1 <= minimum <= maximum <= {MAX_OBJECTS}, "
+        for name in ("kinds", "textures", "poke_length"):  # JSON has lists where we have tuples
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not (all(isinstance(n, int) for n in (self.objects_min, self.objects_max))
+                and 1 <= self.objects_min <= self.objects_max <= MAX_OBJECTS):
+            raise ValueError(f"objects: expected whole numbers, 1 <= minimum <= maximum <= {MAX_OBJECTS}, "
                              f"got {self.objects_min} to {self.objects_max}")
+        for name in ("arena", "cell", "wall_height", "place_within", "pokes_per_scene", "finger_radius", "finger_force",
+                     "finger_speed"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name}: expected a finite number > 0, got {getattr(self, name)}")
+        if self.place_within > 1:
+            raise ValueError(f"place_within: expected a share of the arena, at most 1, got {self.place_within}")
+        length = self.poke_length
+        if not (isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena):
+            raise ValueError(f"poke_length: expected (least, most) in m, shorter than the arena, got {length}")
         for name, known in (("kinds", KINDS), ("textures", TEXTURES)):
             for value in getattr(self, name) or [None]:
                 if value not in known:
                     raise ValueError(f"{name}: expected some of {', '.join(known)}, got {value!r}")
         if self.width < 16 or self.height < 12 or self.width * 3 != self.height * 4:
             raise ValueError(f"width, height: expected 4:3 and at least 16 x 12, got {self.width} x {self.height}")
-
-
-HELD_OUT = {"kinds": ("wedge", "cross"), "textures": ("rings", "zigzag")}  # never in the defaults
-
-
-# --- objects: prisms over one or two convex outlines ---------------------------------------------------
-
-def _rectangle(x0, y0, x1, y1):
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def _regular(sides, radius):
-    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _carton(rng):
-    a, b = rng.uniform(0.028, 0.042), rng.uniform(0.020, 0.028)
-    return [_rectangle(-a, -b, a, b)], rng.uniform(0.035, 0.060), 1.0
-
-
-def _can(rng):
-    return [_regular(20, rng.uniform(0.024, 0.034))], rng.uniform(0.045, 0.070), 1.0
-
-
-def _bracket(rng):
-    length, arm = rng.uniform(0.065, 0.085), rng.uniform(0.024, 0.030)
-    return [_rectangle(0, 0, length, arm), _rectangle(0, arm, arm, length)], rng.uniform(0.030, 0.045), 1.0
-
-
-def _pot(rng):
-    return [_regular(6, rng.uniform(0.030, 0.042))], rng.uniform(0.035, 0.055), rng.uniform(0.6, 0.8)
-
-
-def _wedge(rng):
-    a, b = rng.uniform(0.060, 0.085), rng.uniform(0.050, 0.070)
-    return [np.array([[0, 0], [a, 0], [a / 3, b]])], rng.uniform(0.030, 0.055), 1.0
-
-
-def _cross(rng):
-    a, b = rng.uniform(0.034, 0.044), rng.uniform(0.012, 0.016)
-    return ([_rectangle(-a, -b, a, b), _rectangle(-b, b, b, a), _rectangle(-b, -a, b, -b)],
-            rng.uniform(0.030, 0.045), 1.0)
-
-
-# kind -> (outlines of a random one, density in kg/m^3, range of friction)
-KINDS = {
-    "carton": (_carton, 700.0, (0.45, 0.60)),
-    "can": (_can, 1400.0, (0.55, 0.70)),
-    "bracket": (_bracket, 1000.0, (0.60, 0.80)),
-    "pot": (_pot, 1800.0, (0.50, 0.65)),
-    "wedge": (_wedge, 1200.0, (0.50, 0.75)),
-    "cross": (_cross, 900.0, (0.50, 0.70)),
-}
-
-
-def _area_and_centroid(outline):
-    x, y = outline.T
-    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
-    area = cross.sum() / 2
-    return area, ((outline + np.roll(outline, -1, axis=0)) * cross[:, None]).sum(axis=0) / (6 * area)
-
-
-def _prism(outline, height, taper):
-    """Vertices (2n, 3) of a convex prism, its base at -height/2, its top scaled by `taper`."""
-    base = np.column_stack([outline, np.full(len(outline), -height / 2)])
-    top = np.column_stack([outline * taper, np.full(len(outline), height / 2)])
-    return np.concatenate([base, top])
-
-
-def _prism_mesh(outline, height, taper):
-    """A prism's faces for the renderer, flat-shaded: vertices, normals, texture coordinates, indices."""
-    body = _prism(outline, height, taper)
-    n = len(outline)
-    faces = [([n + i for i in range(n)], outline * taper / 0.08 + 0.5)]  # top; the base is never seen
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1))]) / 0.08
-    for i in range(n):
-        j = (i + 1) % n
-        faces.append(([i, j, n + j, n + i], np.array([[along[i], 0], [along[i + 1], 0],
-                                                      [along[i + 1], height / 0.08], [along[i], height / 0.08]])))
-    vertices, normals, uvs, indices = [], [], [], []
-    for corners, uv in faces:
-        points = body[corners]
-        normal = np.cross(points[1] - points[0], points[2] - points[1])
-        indices += [len(vertices) + k for i in range(1, len(corners) - 1) for k in (0, i, i + 1)]
-        vertices += points.tolist()
-        normals += [(normal / np.linalg.norm(normal)).tolist()] * len(corners)
-        uvs += (uv % 1.0001).tolist() if len(corners) > 4 or corners[0] >= n else uv.tolist()
-    return vertices, normals, uvs, indices
-
-
-# --- textures, drawn with OpenCV ------------------------------------------------------------------------
-
-TEXTURES = ("stripes", "checks", "dots", "patches", "rings", "zigzag")
-
-
-def draw_texture(name, rng, size=64):
-    """A random texture of one style -> (size, size, 3) uint8 RGB, with features big enough for our pictures."""
-    hue = rng.uniform(0, 180)
-    hsv = [[hue, rng.uniform(120, 255), rng.uniform(150, 255)],
-           [(hue + rng.uniform(40, 140)) % 180, rng.uniform(60, 255), rng.uniform(60, 200)]]
-    first, second = cv2.cvtColor(np.uint8([hsv]), cv2.COLOR_HSV2RGB)[0].tolist()
-    image = np.full((size, size, 3), first, np.uint8)
-    step = size // int(rng.integers(2, 4))
-    if name == "stripes":
-        for x in range(0, size, step):
-            cv2.rectangle(image, (x, 0), (x + step // 2 - 1, size), second, -1)
-    elif name == "checks":
-        for i, x in enumerate(range(0, size, step // 2)):
-            for y in range((i % 2) * (step // 2), size, step):
-                cv2.rectangle(image, (x, y), (x + step // 2 - 1, y + step // 2 - 1), second, -1)
-    elif name == "dots":
-        for x in range(step // 2, size, step):
-            for y in range(step // 2, size, step):
-                cv2.circle(image, (x, y), step // 3, second, -1)
-    elif name == "patches":
-        for _ in range(5):
-            centre = rng.integers(0, size, 2)
-            axes = rng.integers(size // 8, size // 4, 2)
-            cv2.ellipse(image, centre.tolist(), axes.tolist(), rng.uniform(0, 180), 0, 360, second, -1)
-    elif name == "rings":
-        for radius in range(step // 3, size, step // 2):
-            cv2.circle(image, (size // 2, size // 2), radius, second, step // 6)
-    elif name == "zigzag":
-        for y in range(-step, size + step, step):
-            corners = np.array([[x, y + (step // 2) * (i % 2)] for i, x in enumerate(range(0, size + step, step // 2))])
-            cv2.polylines(image, [corners.astype(np.int32)], False, second, step // 4)
-    else:
-        raise ValueError(f"texture: expected one of {', '.join(TEXTURES)}, got {name!r}")
-    return image
 
 
 # --- the arena ---------------------------------------------------------------------------------------------
@@ -218,6 +99,7 @@ class Arena:
                                "(ready-made for Python 3.11 and older; later versions compile it)") from None
         self.settings, self.rng, self.bullet = settings, rng, pybullet
         self.camera = arena_camera(settings.width, settings.height)
+        self._plain_settings = asdict(settings)
         self.bullet_seconds = 0.0
         self.bodies, self.pokes_in_scene = [], 0
         self._client = pybullet.connect(pybullet.DIRECT)
@@ -317,7 +199,7 @@ class Arena:
             for _ in range(rng.integers(s.objects_min, s.objects_max + 1)):
                 kind = s.kinds[rng.integers(len(s.kinds))]
                 outlines, height, taper = KINDS[kind][0](rng)
-                radius = max(np.linalg.norm(o, axis=1).max() for o in _centred(outlines)[0])
+                radius = max(np.linalg.norm(o, axis=1).max() for o in centred(outlines)[0])
                 for _ in range(100):
                     xy = rng.uniform(-0.5, 0.5, 2) * s.arena * s.place_within
                     if all(np.linalg.norm(xy - other) > radius + size + 0.004 for other, size in placed):
@@ -331,9 +213,9 @@ class Arena:
     def _add_object(self, kind, outlines, height, taper, xy):
         p, rng, client = self.bullet, self.rng, self._client
         _, density, friction = KINDS[kind]
-        outlines, area = _centred(outlines)
+        outlines, area = centred(outlines)
         if len(outlines) == 1:
-            shape = p.createCollisionShape(p.GEOM_MESH, vertices=_prism(outlines[0], height, taper).tolist(),
+            shape = p.createCollisionShape(p.GEOM_MESH, vertices=prism(outlines[0], height, taper).tolist(),
                                            physicsClientId=client)
         else:  # every outline of a compound is a rectangle
             middles, halves = zip(*[((o[0] + o[2]) / 2, (o[2] - o[0]) / 2) for o in outlines])
@@ -342,7 +224,7 @@ class Arena:
                 collisionFramePositions=[[*m, 0] for m in middles], physicsClientId=client)
         vertices, normals, uvs, indices = [], [], [], []
         for outline in outlines:
-            v, n, t, i = _prism_mesh(outline, height, taper)
+            v, n, t, i = prism_mesh(outline, height, taper)
             indices += [k + len(vertices) for k in i]
             vertices, normals, uvs = vertices + v, normals + n, uvs + t
         look = p.createVisualShape(p.GEOM_MESH, vertices=vertices, normals=normals, uvs=uvs, indices=indices,
@@ -393,8 +275,7 @@ class Arena:
 
         Paper: Sec. IV-A. depth (H, W) m -> (poke (3,), start (2,)) float32, or None where no start is free.
         """
-        s, rng = self.settings, self.rng
-        settings = asdict(s)
+        s, rng, settings = self.settings, self.rng, self._plain_settings
         occupied = occupied_cells(depth, self.empty_depth, self.camera, settings)
         free = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
         centres = cell_centres(settings)
@@ -437,13 +318,6 @@ class Arena:
         self._step(int(length / s.finger_speed / self.TIME_STEP) + 40)  # the last 40 close the final centimetre
         self._place_finger(0, 0, PARK_HEIGHT)
         return self._settle()
-
-
-def _centred(outlines):
-    """Outlines moved so that their common centroid is the origin, and their total area in m^2."""
-    areas, centroids = zip(*[_area_and_centroid(o) for o in outlines])
-    centroid = np.average(centroids, axis=0, weights=areas)
-    return [o - centroid for o in outlines], sum(areas)
 
 
 def occupied_cells(depth, empty_depth, camera, settings, threshold=0.008):
@@ -538,16 +412,16 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
     counts, inside, total, todo = Counter(), 0.0, 0.0, []
     for index, size in enumerate(sizes):
         path = folder / f"shard_{index:04d}.npz"
-        if not path.exists():
+        if not (path.exists() and truth_path(path).exists()):
             todo.append((str(folder), settings, seed, index, size))
             continue
         old = load_shard(path)
         if (old.meta["seed"], old.meta["settings"], len(old)) != (seed, json.loads(json.dumps(asdict(settings))), size):
             raise ValueError(f"{folder}: holds data of another seed, other settings or another number of pokes")
         counts.update(old.meta["counts"])
-    extra = sorted(folder.glob("shard_*.npz"))[2 * len(sizes):]
-    if extra:
-        raise ValueError(f"{folder}: holds more shards than {pokes} pokes make ({extra[0].name})")
+    extra = folder / f"shard_{len(sizes):04d}.npz"
+    if extra.exists():
+        raise ValueError(f"{folder}: holds more shards than {pokes} pokes make ({extra.name})")
     done = pokes - sum(job[4] for job in todo)
 
     def account(job, result):

@@ -20,11 +20,6 @@ SETTINGS = {"arena": 0.5, "cell": 0.025}
 PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
 
 
-def gap(raises, reason):
-    """A promise the code does not keep yet: remove the mark together with the gap."""
-    return pytest.mark.xfail(strict=True, raises=raises, reason=reason)
-
-
 def make_camera(**changed):
     values = dict(width=WIDTH, height=HEIGHT, fx=9.7, fy=9.3, cx=3.4, cy=2.6,
                   arena_from_camera=look_at((0.05, -0.46, 0.62), (0, 0, 0)))
@@ -233,7 +228,6 @@ def test_flipped_regions_never_pass_as_data(tmp_path):
     assert refused > 30
 
 
-@gap((NotImplementedError, RuntimeError), "zipfile has more exceptions than load_npz catches")
 def test_a_flipped_bit_anywhere_is_refused_or_harmless(tmp_path):
     path = write(tmp_path)
     raw, good = path.read_bytes(), load_shard(path)
@@ -266,7 +260,6 @@ def test_other_files_named_npz(tmp_path, content):
     assert_refused(path)
 
 
-@gap((TypeError, AttributeError), "np.load returns an array, not an archive")
 def test_a_single_array_named_npz(tmp_path):
     path = tmp_path / "shard_0000.npz"
     with open(path, "wb") as file:
@@ -305,7 +298,6 @@ def test_a_checkpoint_is_not_a_shard(tmp_path):
 
 
 @pytest.mark.parametrize("meta", [[1, 2], 3, "text", None])
-@gap(AttributeError, "load_npz asks meta.get")
 def test_meta_that_is_no_dict(tmp_path, meta):
     path = write(tmp_path)
     save_npz(path, load_npz(path, FORMAT)[0], meta)
@@ -359,7 +351,6 @@ def test_missing_field_is_named(tmp_path, name):
     assert_refused(path, name)
 
 
-@gap(KeyError, "load_shard does not look at the settings")
 def test_missing_settings(tmp_path):
     path = write(tmp_path)
     rewrite(path, without=("settings",))
@@ -432,7 +423,6 @@ def test_load_interactions_never_opens_the_truth(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["labels", "poses_before", "poses_after"])
-@gap(KeyError, "load_truth does not check")
 def test_truth_without_an_array_names_the_file(tmp_path, name):
     path = truth_path(write(tmp_path))
     rewrite(path, without=(name,))
@@ -440,7 +430,6 @@ def test_truth_without_an_array_names_the_file(tmp_path, name):
         load_truth(tmp_path)
 
 
-@gap(pytest.fail.Exception, "load_truth does not check")
 def test_truth_of_another_length_names_the_file(tmp_path):
     path = truth_path(write(tmp_path))
     rewrite(path, arrays={"labels": make_truth().labels[:2]})  # would shift every later shard's labels
@@ -574,9 +563,9 @@ def test_positions_outside_are_clipped_to_the_rim():
 # --- depth noise ------------------------------------------------------------------------------------------
 
 def two_levels():
-    """Depth with its median at 0.5 m, a quarter of the valid pixels at 1 m, and many missing ones."""
+    """Depth with its median at 0.5 m, a quarter of the valid pixels at 1 m, and more than half of them missing."""
     depth = np.full((200, 200), 0.5, np.float32)
-    depth[:50], depth[::2, ::2] = 1.0, 0
+    depth[:50], depth[190:], depth[:, ::2] = 1.0, 0, 0
     return depth
 
 
@@ -588,7 +577,7 @@ def test_depth_noise_statistics():
         assert here.std() == pytest.approx(expected, rel=4 / np.sqrt(2 * here.size))  # four standard errors
         assert abs(here.mean()) < 4 * expected / np.sqrt(here.size)
         assert np.mean(np.abs(here) > 1.96 * expected) == pytest.approx(0.05, abs=0.01)  # Gaussian tails
-    relative = noise[1::2] / depth[1::2]  # the rows without missing pixels
+    relative = noise[:190, 1::2] / depth[:190, 1::2]  # what is not missing
     assert abs(np.corrcoef(relative[:, 1:].ravel(), relative[:, :-1].ravel())[0, 1]) < 0.03  # neighbours independent
 
 
@@ -624,7 +613,6 @@ def test_depth_noise_depends_on_the_seed_only():
     assert (first != other)[depth > 0].mean() > 0.9
 
 
-@gap(AssertionError, "the median is over all pictures")
 def test_depth_noise_of_many_pictures_takes_each_pictures_own_median():
     near, far = np.full((60, 60), 0.5), np.full((60, 60), 1.0)
     noise = add_depth_noise(np.stack([near, far, far]), np.random.default_rng(0)) - np.stack([near, far, far])
