@@ -85,7 +85,8 @@ def table(summary):
     lines = ["| figure | measured | goal |", "|---|---|---|"]
     for name, (_, _, text, form, goal) in HEADLINES.items():
         if name in summary:
-            lines.append(f"| {text} | {form.format(summary[name])} | {goal.replace('<=', '&le;').replace('>=', '&ge;')} |")
+            goal = goal.replace("<=", "\u2264").replace(">=", "\u2265")
+            lines.append(f"| {text} | {form.format(summary[name])} | {goal} |")
     return "\n".join(lines)
 
 

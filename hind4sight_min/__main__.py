@@ -216,7 +216,8 @@ def run_demo(args):
     figures.save_figure(show_row(run, test, row, truth), out / "interaction.png")
     seconds = time.perf_counter() - start
     print(f"{out / 'interaction.png'}\nThe whole demo took {seconds:.0f} s.")
-    write_json(args.json or out / "metrics.json", {**{f"demo_{k}": v for k, v in metrics.items()}, "demo_seconds": seconds})
+    figures_found = {f"demo_{name}": value for name, value in metrics.items()}
+    write_json(args.json or out / "metrics.json", {**figures_found, "demo_seconds": seconds})
 
 
 class OneLineParser(argparse.ArgumentParser):

@@ -120,10 +120,10 @@ class Arena:
         p.setPhysicsEngineParameter(fixedTimeStep=self.TIME_STEP, deterministicOverlappingPairs=1,
                                     physicsClientId=self._client)
         self._static_box([0, 0, -0.02], [1.0, 1.0, 0.02], [0.62, 0.60, 0.56, 1], friction=0.6)
-        half, thick, high = s.arena / 2, 0.01, s.wall_height / 2
+        half, thick, high, white = s.arena / 2, 0.01, s.wall_height / 2, [0.9, 0.9, 0.88, 1]
         for sign in (-1, 1):
-            self._static_box([sign * (half + thick), 0, high], [thick, half + 2 * thick, high], [0.9, 0.9, 0.88, 1], 0.3)
-            self._static_box([0, sign * (half + thick), high], [half, thick, high], [0.9, 0.9, 0.88, 1], 0.3)
+            self._static_box([sign * (half + thick), 0, high], [thick, half + 2 * thick, high], white, 0.3)
+            self._static_box([0, sign * (half + thick), high], [half, thick, high], white, 0.3)
         self._build_finger()
         # Bullet's software renderer samples at a pixel's corner; this frustum puts the corners of the fine
         # picture where the camera model wants the pixel centres. See test_simulator for the check.
@@ -295,8 +295,9 @@ class Arena:
     def _descent_is_free(self, x, y):
         """The finger is a tall cylinder: lowered, it fills the whole column of its descent."""
         self._place_finger(x, y, 0)
-        self.bullet.performCollisionDetection(physicsClientId=self._client)
-        free = not any(self.bullet.getClosestPoints(self._finger, body, 0.002, linkIndexA=2, physicsClientId=self._client)
+        p, client = self.bullet, self._client
+        p.performCollisionDetection(physicsClientId=client)
+        free = not any(p.getClosestPoints(self._finger, body, 0.002, linkIndexA=2, physicsClientId=client)
                        for body in self.bodies)
         self._place_finger(0, 0, PARK_HEIGHT)
         return free

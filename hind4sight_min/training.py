@@ -38,9 +38,11 @@ class Batch:
 
 
 def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
-    """The Batch of some rows, with the depth noise of Sec. IV-B (SD in m) drawn from `rng`. `mirror`, a bool or one per row, shows the arena mirrored at its plane x = 0,
-    which costs no new poke: pictures flip left-right, a_x changes sign, a_theta becomes pi - a_theta. This is
-    exact for a camera that is symmetric about that plane; ValueError for another.
+    """The Batch of some rows of a data set.
+
+    mirror, a bool or one per row, shows the arena mirrored at its plane x = 0, which costs no new poke: pictures flip
+    left-right, a_x changes sign, a_theta becomes pi - a_theta. This is exact for a camera that is symmetric about
+    that plane; ValueError for another. depth_noise: SD in m of Sec. IV-B's depth noise, drawn from `rng`.
     """
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))

@@ -358,6 +358,16 @@ def test_missing_settings(tmp_path):
         load_interactions(tmp_path)
 
 
+@pytest.mark.parametrize("settings", [[], None, 3, {"arena": 0.5}, {"arena": "wide", "cell": 0.1},
+                                      {"arena": 0.5, "cell": -0.1}, {"arena": float("nan"), "cell": 0.1}], ids=str)
+def test_settings_without_a_grid(tmp_path, settings, request):
+    if not isinstance(settings, dict):
+        request.applymarker(pytest.mark.xfail(strict=True, raises=AttributeError, reason="settings is asked for .get"))
+    path = write(tmp_path)
+    rewrite(path, meta={"settings": settings})
+    assert_refused(path)
+
+
 def test_unknown_array_is_named(tmp_path):
     path = write(tmp_path)
     rewrite(path, arrays={"forces": np.zeros(3)})

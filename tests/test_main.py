@@ -81,8 +81,8 @@ def test_training_never_needs_the_truth(tmp_path):
 
 @needs_bullet
 def test_collect_writes_shards_and_figures(tmp_path, capsys):
-    assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures", "rings",
-               "--json", tmp_path / "collect.json") == 0
+    assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures",
+               "rings", "--json", tmp_path / "collect.json") == 0
     assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
     figures = json.loads((tmp_path / "collect.json").read_text())
     assert figures["pokes_kept"] == 3 and 0 < figures["collect_share_in_bullet"] <= 1

@@ -44,7 +44,8 @@ def test_readme_points_to_functions_and_files_that_exist():
     assert len(names) > 20
     for module, name in names:
         assert hasattr(importlib.import_module(f"hind4sight_min.{module}"), name), (module, name)
-    paths = re.findall(r"`((?:tests|docs|data_small|benchmarks)/[\w./]*)`", README) + re.findall(r"\]\((docs/[^)]+)\)", README)
+    paths = re.findall(r"`((?:tests|docs|data_small|benchmarks)/[\w./]*)`", README)
+    paths += re.findall(r"\]\((docs/[^)]+)\)", README)
     assert len(paths) > 10
     for path in paths:
         assert (ROOT / path).exists(), path
