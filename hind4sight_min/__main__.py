@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import evaluation, figures, simulator, training
+from . import evaluation, simulator, training
 from .geometry import project
 from .interactions import load_interactions, load_truth, whole_file
 from .losses import distance_maps, warp_backward
@@ -80,8 +80,9 @@ def print_metrics(metrics):
         print(f"  {meaning:<40}{metrics[name]:8.3f} {unit:<4}{beside}".rstrip())
 
 
-def show_row(run, interactions, row, truth=None):
-    """The figure of one interaction: what the robot saw, and what the model makes of it."""
+def show_row(run, interactions, row, truth, path):
+    """Save the figure of one interaction: what the robot saw, and what the model makes of it."""
+    from . import figures  # here: Matplotlib takes a third of a second to import, in every worker process too
     camera, settings = interactions.camera, interactions.meta["settings"]
     shape = (camera.height, camera.width)
     batch, prediction, flow, start_heatmap, end_heatmap = evaluation.predict(run, interactions, np.array([row]))
@@ -90,20 +91,19 @@ def show_row(run, interactions, row, truth=None):
     points = batch.points[0].reshape(*shape, 3)
     poke, start = interactions.pokes[row], interactions.starts[row]
     ends = np.array([[*start, 0], [*poke[:2], 0]], np.float32)
-    extra = {}
-    if truth is not None:
-        true = evaluation.true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
-        labels = truth.labels[row]
-        moved = np.unique(labels[np.linalg.norm(true, axis=2) > evaluation.MOVING])
-        extra = {"true_scene_flow": true, "true_optical_flow": evaluation.optical_flow(points, points + true, camera),
-                 "true_labels": np.where(np.isin(labels, moved), labels, 0)}
-    return figures.interaction_figure(
+    true = evaluation.true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
+    labels = truth.labels[row]
+    moved = np.unique(labels[np.linalg.norm(true, axis=2) > evaluation.MOVING])
+    figure = figures.interaction_figure(
         image=batch.images[0], next_image=batch.next_images[0], points=points,
         scene_flow=prediction.points[0].reshape(*shape, 3) - points, masks=prediction.masks[0].reshape(*shape, -1),
         optical_flow=flow[0], warped=warped[0], distance_predicted=maps[0][0].reshape(shape),
         distance_observed=maps[1][0].reshape(shape), start_heatmap=start_heatmap.reshape(interactions.grid_shape),
         end_heatmap=end_heatmap.reshape(interactions.grid_shape), arena=settings["arena"], poke=poke, start=start,
-        poke_pixels=project(ends, camera), valid=batch.valid[0].reshape(shape), **extra)
+        poke_pixels=project(ends, camera), valid=batch.valid[0].reshape(shape), true_scene_flow=true,
+        true_optical_flow=evaluation.optical_flow(points, points + true, camera),
+        true_labels=np.where(np.isin(labels, moved), labels, 0))
+    figures.save_figure(figure, path)
 
 
 # --- commands ----------------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ def run_show(args):
     check_camera(run, interactions, args.data)
     if not 0 <= args.row < len(interactions):
         raise ValueError(f"row: expected 0 to {len(interactions) - 1}, got {args.row}")
-    figures.save_figure(show_row(run, interactions, args.row, truth), args.out)
+    show_row(run, interactions, args.row, truth, args.out)
     print(args.out)
 
 
@@ -213,7 +213,7 @@ def run_demo(args):
     print("4. Look at one of them.")
     motion = [np.abs(truth.poses_after[i] - truth.poses_before[i]).max() for i in range(len(test))]
     row = int(np.argsort(motion)[int(0.7 * len(motion))])  # a poke that moved something well, not the best one
-    figures.save_figure(show_row(run, test, row, truth), out / "interaction.png")
+    show_row(run, test, row, truth, out / "interaction.png")
     seconds = time.perf_counter() - start
     print(f"{out / 'interaction.png'}\nThe whole demo took {seconds:.0f} s.")
     figures_found = {f"demo_{name}": value for name, value in metrics.items()}

@@ -3,7 +3,6 @@
 This file reads the simulator's truth; training does not.
 """
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from .geometry import optical_flow
 from .interactions import cell_centres, true_scene_flow
@@ -48,6 +47,7 @@ def matched_iou(masks, labels, moved):
     masks (N, K) soft, 0 = background; labels (N,) int; moved: the labels of the moved objects -> (len(moved),).
     A pixel belongs to its largest mask. An object without a mask scores 0.
     """
+    from scipy.optimize import linear_sum_assignment  # here: it takes as long to import as all the rest
     hard = np.argmax(masks, axis=1)
     iou = np.zeros((len(moved), masks.shape[1] - 1))
     for i, label in enumerate(moved):
