@@ -192,7 +192,7 @@ def run_show(args):
 
 
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
-DEMO_RECIPE = training.Recipe(steps=600, batch=8)
+DEMO_RECIPE = training.Recipe(steps=500)
 
 
 def run_demo(args):

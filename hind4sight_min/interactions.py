@@ -39,8 +39,9 @@ class Interactions:
 
     def __post_init__(self):
         count, size = len(self.pokes), (self.camera.height, self.camera.width)
+        settings = self.meta.get("settings")
         for name in ("arena", "cell"):
-            if not 0 < self.meta.get("settings", {}).get(name, 0) < float("inf"):
+            if not (isinstance(settings, dict) and 0 < settings.get(name, 0) < float("inf")):
                 raise ValueError(f"meta: expected settings with a positive {name!r} in m")
         expected = {"rgb_before": (count, *size, 3), "rgb_after": (count, *size, 3),
                     "depth_before": (count, *size), "depth_after": (count, *size),
@@ -142,7 +143,7 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     The SD is `standard_deviation` metres at each picture's median depth, and proportional to depth.
     depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing.
     """
-    if not standard_deviation >= 0:
+    if not 0 <= standard_deviation < float("inf"):
         raise ValueError(f"standard_deviation: expected a number of metres >= 0, got {standard_deviation}")
     valid = depth > 0
     median = np.ma.median(np.ma.array(depth, mask=~valid), axis=(-2, -1), keepdims=True)
@@ -244,12 +245,16 @@ def load_shard(path):
         raise ValueError(f"{path}: {error}") from None
 
 
+def find_shards(folder):
+    """The shards of a data set, in order, without their truth files; none where there is no folder."""
+    return sorted(path for path in Path(folder).glob("shard_*.npz") if not path.name.endswith(".truth.npz"))
+
+
 def shards_in(folder):
     """The shards of a data set, in order. Raises ValueError if there is none."""
-    folder = Path(folder)
-    if not folder.is_dir():
+    if not Path(folder).is_dir():
         raise ValueError(f"{folder}: no such folder")
-    shards = sorted(path for path in folder.glob("shard_*.npz") if not path.name.endswith(".truth.npz"))
+    shards = find_shards(folder)
     if not shards:
         raise ValueError(f"{folder}: no shard_*.npz in it; 'hind4sight collect' makes them")
     return shards

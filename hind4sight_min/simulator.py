@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from .geometry import Camera, look_at, unproject
-from .interactions import (Interactions, Truth, cell_centres, cells_of, grid_shape, load_shard,
+from .interactions import (Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
                            save_shard, truth_path)
 from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
 
@@ -51,14 +51,20 @@ class Settings:
         for name in ("kinds", "textures", "poke_length"):  # JSON has lists where we have tuples
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
-        if not (all(isinstance(n, int) for n in (self.objects_min, self.objects_max))
-                and 1 <= self.objects_min <= self.objects_max <= MAX_OBJECTS):
-            raise ValueError(f"objects: expected whole numbers, 1 <= minimum <= maximum <= {MAX_OBJECTS}, "
+        for name in ("objects_min", "objects_max", "pokes_per_scene", "width", "height"):
+            if not isinstance(getattr(self, name), int):
+                raise ValueError(f"{name}: expected a whole number, got {getattr(self, name)}")
+        if not (1 <= self.objects_min <= self.objects_max <= MAX_OBJECTS):
+            raise ValueError(f"objects: expected 1 <= minimum <= maximum <= {MAX_OBJECTS}, "
                              f"got {self.objects_min} to {self.objects_max}")
         for name in ("arena", "cell", "wall_height", "place_within", "pokes_per_scene", "finger_radius", "finger_force",
                      "finger_speed"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name}: expected a finite number > 0, got {getattr(self, name)}")
+        cells = self.arena / self.cell
+        if self.arena > 0.5 or abs(cells - round(cells)) > 1e-6:
+            raise ValueError(f"arena, cell: expected an arena of at most 0.5 m, which the camera sees, in whole cells, "
+                             f"got {self.arena} and {self.cell}")
         if self.place_within > 1:
             raise ValueError(f"place_within: expected a share of the arena, at most 1, got {self.place_within}")
         length = self.poke_length
@@ -403,26 +409,22 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
     seconds, and the share of the workers' time spent inside Bullet's stepping and rendering.
     Raises ValueError for bad counts or a folder with other data in it.
     """
-    for name, value in (("pokes", pokes), ("jobs", jobs)):
-        if value < 1:
-            raise ValueError(f"{name}: expected a whole number >= 1, got {value}")
-    if seed < 0:
-        raise ValueError(f"seed: expected a whole number >= 0, got {seed}")
+    for name, value, least in (("pokes", pokes, 1), ("jobs", jobs, 1), ("seed", seed, 0)):
+        if not isinstance(value, int) or value < least:
+            raise ValueError(f"{name}: expected a whole number >= {least}, got {value}")
     folder, start = Path(folder), time.perf_counter()
-    sizes = [min(SHARD_POKES, pokes - first) for first in range(0, pokes, SHARD_POKES)]
-    counts, inside, total, todo = Counter(), 0.0, 0.0, []
-    for index, size in enumerate(sizes):
-        path = folder / f"shard_{index:04d}.npz"
-        if not (path.exists() and truth_path(path).exists()):
-            todo.append((str(folder), settings, seed, index, size))
-            continue
+    sizes = {f"shard_{i:04d}.npz": min(SHARD_POKES, pokes - first)
+             for i, first in enumerate(range(0, pokes, SHARD_POKES))}
+    counts, inside, total, missing = Counter(), 0.0, 0.0, dict(sizes)
+    for path in find_shards(folder):
         old = load_shard(path)
-        if (old.meta["seed"], old.meta["settings"], len(old)) != (seed, json.loads(json.dumps(asdict(settings))), size):
-            raise ValueError(f"{folder}: holds data of another seed, other settings or another number of pokes")
-        counts.update(old.meta["counts"])
-    extra = folder / f"shard_{len(sizes):04d}.npz"
-    if extra.exists():
-        raise ValueError(f"{folder}: holds more shards than {pokes} pokes make ({extra.name})")
+        if (old.meta["seed"], old.meta["settings"], len(old)) != (seed, json.loads(json.dumps(asdict(settings))),
+                                                                 sizes.get(path.name)):
+            raise ValueError(f"{path}: holds data of another seed, other settings or another number of pokes")
+        if truth_path(path).exists():
+            counts.update(old.meta["counts"])
+            del missing[path.name]
+    todo = [(str(folder), settings, seed, list(sizes).index(name), size) for name, size in missing.items()]
     done = pokes - sum(job[4] for job in todo)
 
     def account(job, result):
