@@ -113,7 +113,7 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 
 # From an audit of the terms between no motion and the true motion: 3D falls by 0.04 m^2, the photometric
 # term by 16, while flow smoothness rises by 45 px; see docs/research-log.md.
-WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 0.1, "flow_smoothness": 0.003, "inverse": 1.0}
+WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 0.1, "flow_smoothness": 0.01, "inverse": 1.0}
 
 
 @dataclass(frozen=True)
