@@ -120,8 +120,9 @@ def run_collect(args):
 def print_collection(folder, result):
     counts = result["counts"]
     dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
-    print(f"{folder}: {counts['kept']} pokes in {result['seconds']:.1f} s; dropped: {dropped}; "
-          f"{100 * result['share_in_bullet']:.0f} % of the time in Bullet's stepping and rendering")
+    share = result["share_in_bullet"]
+    spent = "all there already" if share is None else f"{share:.0%} of the time in Bullet's stepping and rendering"
+    print(f"{folder}: {counts['kept']} pokes in {result['seconds']:.1f} s; dropped: {dropped}; {spent}")
 
 
 def run_train(args):

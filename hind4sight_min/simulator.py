@@ -3,6 +3,7 @@
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
 import json
+import signal
 import tempfile
 import time
 from collections import Counter
@@ -196,9 +197,12 @@ class Arena:
     # -- scenes --
 
     def new_scene(self):
-        """Put down a fresh random set of objects, apart from each other, and let them settle."""
+        """Put down a fresh random set of objects, apart from each other, and let them settle.
+
+        Raises ValueError when they do not fit in 100 tries.
+        """
         p, s, rng = self.bullet, self.settings, self.rng
-        while True:
+        for _ in range(100):
             for body in self.bodies:
                 p.removeBody(body, physicsClientId=self._client)
             self.bodies, placed = [], []
@@ -215,6 +219,7 @@ class Arena:
             self.pokes_in_scene = 0
             if len(self.bodies) >= s.objects_min and self._settle():
                 return
+        raise ValueError(f"objects: {s.objects_min} of them do not fit into {s.place_within:.0%} of a {s.arena} m arena")
 
     def _add_object(self, kind, outlines, height, taper, xy):
         p, rng, client = self.bullet, self.rng, self._client
@@ -348,7 +353,7 @@ def collect_shard(settings, seed, index, pokes):
     """Collect one shard -> (Interactions, Truth, seconds inside Bullet). The same arguments give the same data.
 
     Interactions are dropped, and counted in meta["counts"], when an object left the arena, is out of the
-    camera's sight, or never came to rest.
+    camera's sight, or never came to rest. Raises ValueError for settings under which that is nearly always so.
     """
     rng = np.random.default_rng([seed, index])
     kept, counts = [], Counter(kept=0, left_arena=0, out_of_view=0, not_at_rest=0, no_free_start=0)
@@ -367,6 +372,8 @@ def collect_shard(settings, seed, index, pokes):
                 arena.pokes_in_scene += 1
                 before = after
             counts[trouble or "kept"] += 1
+            if counts.total() > 20 * (len(kept) + 10):
+                raise ValueError(f"settings: hardly a poke can be used ({dict(counts)})")
             if trouble or arena.pokes_in_scene == settings.pokes_per_scene:
                 arena.new_scene()
                 before = arena.observe(), arena.poses()
@@ -406,7 +413,8 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
     """Collect `pokes` interactions into `folder`; shards already there from the same call are kept.
 
     progress(done, total) is called after every shard. Returns a dict: counts of kept and dropped pokes,
-    seconds, and the share of the workers' time spent inside Bullet's stepping and rendering.
+    seconds, and the share of the workers' time spent inside Bullet's stepping and rendering (None if no shard was
+    missing).
     Raises ValueError for bad counts or a folder with other data in it.
     """
     for name, value, least in (("pokes", pokes, 1), ("jobs", jobs, 1), ("seed", seed, 0)):
@@ -438,9 +446,14 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
         for job in todo:
             account(job, _collect_job(*job))
     else:  # fresh processes: Bullet and thread pools do not survive a fork
-        with ProcessPoolExecutor(min(jobs, len(todo)), mp_context=get_context("spawn")) as pool:
+        ignore = (signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the parent to handle
+        with ProcessPoolExecutor(min(jobs, len(todo)), get_context("spawn"), signal.signal, ignore) as pool:
             futures = {pool.submit(_collect_job, *job): job for job in todo}
-            for future in as_completed(futures):
-                account(futures[future], future.result())
+            try:
+                for future in as_completed(futures):
+                    account(futures[future], future.result())
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # what has not begun is left for the next call
+                raise
     return {"counts": dict(counts), "seconds": time.perf_counter() - start,
-            "share_in_bullet": inside / total if total else float("nan")}
+            "share_in_bullet": inside / total if total else None}

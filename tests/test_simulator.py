@@ -940,3 +940,13 @@ def test_collect_refuses_bad_counts(tmp_path, changed, name):
     with pytest.raises(ValueError, match=f"{name}.*{changed[name]}"):
         collect(tmp_path / "new", **{**dict(pokes=1, seed=0), **changed})
     assert not (tmp_path / "new").exists()
+
+
+@needs_bullet
+def test_settings_that_give_no_scene_or_no_poke_end_in_an_error(monkeypatch):
+    crowd = Settings(objects_min=7, objects_max=7, place_within=0.1, width=16, height=12)
+    with Arena(crowd, np.random.default_rng(0)) as arena, pytest.raises(ValueError, match="do not fit"):
+        arena.new_scene()
+    monkeypatch.setattr(Arena, "sample_poke", lambda *_: None)
+    with pytest.raises(ValueError, match="no_free_start"):
+        simulator.collect_shard(Settings(width=16, height=12), 0, 0, 1)
