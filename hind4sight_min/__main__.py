@@ -141,7 +141,10 @@ def run_train(args):
 
 
 def train_and_save(run, interactions, path, jobs, save_every=60.0):
-    """Train to the recipe's end; a checkpoint every minute and a log line and CSV row every epoch."""
+    """Train to the recipe's end: a checkpoint every minute, a log line and a CSV row every epoch, then a picture
+    of the loss terms. Returns the seconds spent on the whole run, over all calls.
+    """
+    from . import figures
     path = Path(path)
     show, before, start = progress_line("train"), run.meta.get("seconds", 0.0), time.perf_counter()
     saved = [start]
@@ -165,6 +168,7 @@ def train_and_save(run, interactions, path, jobs, save_every=60.0):
 
     training.train(interactions, run, jobs, on_epoch=on_epoch, on_step=on_step)
     save()
+    figures.save_figure(figures.training_figure(run.log), path.with_suffix(".png"))
     return run.meta["seconds"]
 
 
@@ -253,7 +257,7 @@ def build_parser():
     recipe = training.Recipe()
     sub = command("train", run_train, "train the full model (Eq. 6) on a folder of shards, without labels")
     sub.add_argument("data", nargs="?", default=small / "train")
-    sub.add_argument("out", help="checkpoint to write (.npz); its log goes beside it (.csv)")
+    sub.add_argument("out", help="checkpoint to write (.npz); its log goes beside it (.csv and .png)")
     sub.add_argument("--steps", type=int, default=recipe.steps)
     sub.add_argument("--batch", type=int, default=recipe.batch)
     sub.add_argument("--learning-rate", type=float, default=recipe.learning_rate)

@@ -43,7 +43,8 @@ def test_train_resume_evaluate_show(tmp_path, capsys):
 
     assert run("show", model, data_small() / "test", "--row", 5, "--out", tmp_path / "poke.png") == 0
     assert (tmp_path / "poke.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.csv", "model.npz", "poke.png", "train.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.csv", "model.npz", "model.png", "poke.png",
+                                                                  "train.json"]
 
 
 def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp_path, capsys):
