@@ -111,8 +111,7 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 
 # --- the loop ----------------------------------------------------------------------------------------------
 
-# From an audit of the terms between no motion and the true motion: 3D falls by 0.04 m^2, the photometric
-# term by 16, while flow smoothness rises by 45 px; see docs/research-log.md.
+# From an audit of gradient norms, not of the terms' values, which mislead; see docs/research-log.md.
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 0.1, "flow_smoothness": 0.01, "inverse": 1.0}
 
 
@@ -121,9 +120,9 @@ class Recipe:
     """Everything that decides a training run besides the data.
 
     steps: Adam steps. batch: interactions per step. learning_rate: peak; linear warm-up over `warmup` steps,
-    then a cosine to zero. ramp: the 2D terms grow from 0 to their weight between these shares of all steps
-    (from a cold start they teach the network to move nothing). depth_noise: SD in m added
-    to the depth, Sec. IV-B. weights: one per term of Eq. (6).
+    then a cosine to zero. ramp: the 2D terms grow from 0 to their weight between these shares of all steps (from a
+    cold start they teach the network to move nothing). depth_noise: SD in m of noise added to the depth, Sec. IV-B.
+    mirror: show half of the interactions mirrored. weights: one per term of Eq. (6).
     """
     steps: int = 3000
     batch: int = 16
