@@ -197,7 +197,7 @@ def run_show(args):
 
 
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
-DEMO_RECIPE = training.Recipe(steps=500)
+DEMO_RECIPE = training.Recipe(steps=600)
 
 
 def run_demo(args):
