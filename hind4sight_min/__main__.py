@@ -133,8 +133,14 @@ def run_train(args):
         if Path(args.out).exists():
             raise ValueError(f"{args.out}: exists already; --resume goes on with it")
         recipe = training.Recipe(steps=args.steps, batch=args.batch, learning_rate=args.learning_rate, seed=args.seed,
-                                 depth_noise=args.depth_noise, sizes=Sizes(masks=args.masks, width=args.width))
+                                 depth_noise=args.depth_noise, sizes=Sizes(masks=args.masks, width=args.width),
+                                 ramp=args.ramp, weights={**training.WEIGHTS, **dict(args.weight)})
         run = training.start_run(recipe, interactions)
+        if args.start:
+            start = training.load_run(args.start)
+            if start.layout != run.layout:
+                raise ValueError(f"{args.start}: has networks of other sizes than this run")
+            run.vector = start.vector
     seconds = train_and_save(run, interactions, args.out, args.jobs)
     print(f"{args.out}: {run.step} steps, {seconds:.0f} s in all")
     write_json(args.json, {"train_seconds": seconds, **{f"loss_{k}": v for k, v in run.log[-1].items()}})
@@ -225,6 +231,14 @@ def run_demo(args):
     write_json(args.json or out / "metrics.json", {**figures_found, "demo_seconds": seconds})
 
 
+def term_weight(text):
+    """'photometric=0.5' -> ('photometric', 0.5)."""
+    name, _, value = text.partition("=")
+    if name not in training.WEIGHTS:
+        raise argparse.ArgumentTypeError(f"expected TERM=VALUE with one of {', '.join(training.WEIGHTS)}, got {text!r}")
+    return name, float(value)
+
+
 class OneLineParser(argparse.ArgumentParser):
     """argparse without the usage text before an error."""
 
@@ -261,6 +275,11 @@ def build_parser():
     sub.add_argument("--steps", type=int, default=recipe.steps)
     sub.add_argument("--batch", type=int, default=recipe.batch)
     sub.add_argument("--learning-rate", type=float, default=recipe.learning_rate)
+    sub.add_argument("--weight", type=term_weight, action="append", default=[], metavar="TERM=VALUE",
+                     help=f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(recipe.weights)}")
+    sub.add_argument("--ramp", type=float, nargs=2, default=recipe.ramp, metavar=("FROM", "TO"),
+                     help="shares of the steps between which the 2D terms' weights grow from 0")
+    sub.add_argument("--start", metavar="CHECKPOINT", help="begin with its parameters instead of random ones")
     sub.add_argument("--depth-noise", type=float, default=0.0, help="SD in m of the depth noise to train under")
     sub.add_argument("--masks", type=int, default=Sizes.masks, help="K, background included")
     sub.add_argument("--width", type=int, default=Sizes.width, help="units per layer of the forward model")

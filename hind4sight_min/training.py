@@ -140,8 +140,12 @@ class Recipe:
         for name in ("steps", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate: expected a number > 0, got {self.learning_rate}")
+        if not 0 < self.learning_rate < float("inf"):
+            raise ValueError(f"learning_rate: expected a finite number > 0, got {self.learning_rate}")
+        if not (len(self.ramp) == 2 and 0 <= self.ramp[0] < self.ramp[1]):
+            raise ValueError(f"ramp: expected two shares of the steps, 0 <= from < to, got {self.ramp}")
+        if set(self.weights) != set(WEIGHTS) or not all(0 <= value < float("inf") for value in self.weights.values()):
+            raise ValueError(f"weights: expected a finite number >= 0 for each of {sorted(WEIGHTS)}, got {self.weights}")
 
 
 def learning_rate(recipe, step):

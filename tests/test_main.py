@@ -147,6 +147,25 @@ def test_an_existing_checkpoint_is_not_overwritten(tmp_path, capsys):
     assert out.read_bytes() == b"precious"
 
 
+def test_weights_and_starting_point(tmp_path, capsys):
+    first, second, third = (tmp_path / f"{name}.npz" for name in "abc")
+    assert run("train", data_small() / "train", first, *TRAIN) == 0
+    assert run("train", data_small() / "train", second, *TRAIN, "--start", first, "--weight", "chamfer=0",
+               "--weight", "photometric=0.7", "--ramp", 0, 0.5, "--learning-rate", 1e-9) == 0
+    went_on = training.load_run(second)
+    assert went_on.recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
+    assert went_on.recipe.ramp == (0, 0.5)
+    np.testing.assert_allclose(went_on.vector, training.load_run(first).vector, atol=1e-7)  # hardly a step away
+    capsys.readouterr()
+    one_line(capsys, run("train", data_small() / "train", third, *TRAIN, "--width", 12, "--start", first), "a.npz")
+    for wrong in ("chamfers=1", "chamfer", "chamfer=much"):
+        with pytest.raises(SystemExit) as stop:
+            run("train", data_small() / "train", third, "--weight", wrong)
+        one_line(capsys, stop.value.code, "weight")
+    one_line(capsys, run("train", data_small() / "train", third, "--ramp", 0.5, 0.5), "ramp")
+    one_line(capsys, run("train", data_small() / "train", third, "--weight", "chamfer=-1"), "weights")
+
+
 def test_rows_outside_the_data(tmp_path, capsys):
     model = tmp_path / "model.npz"
     run("train", data_small() / "train", model, *TRAIN)
