@@ -17,26 +17,15 @@ EDGE_SHARPNESS = 40.0
 
 # --- 3D -----------------------------------------------------------------------------------------------
 
-def distance_maps(predicted, observed, valid_predicted, valid_observed, background=None, hidden=None,
-                  next_hidden=None):
+def distance_maps(predicted, observed, valid_predicted, valid_observed):
     """The two distance transforms between clouds, each on its own cloud's grid.
 
     Paper: Sec. III-B.  D_{P'->P}(i) = min_j |P'_i - P_j|^2,  D_{P->P'}(j) = min_i |P'_i - P_j|^2.
     predicted, observed (B, N, 3) m; valid_* (B, N) bool -> two maps (B, N) m^2, 0 where not valid.
     The first lives on frame t's grid, the second on frame t+1's.
-
-    Not in the paper: with background (B, N, 3), the cloud of the empty arena (Sec. IV-A), the neighbours j and i
-    also range over those of its points that objects hide in frame t+1 and in frame t: next_hidden, hidden (B, N)
-    bool. The table is there although the camera does not see it; otherwise what an object covers or uncovers
-    costs more than a wrong motion, and dragging the table along is the cheapest way out.
     """
-    if background is None:
-        return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
-                nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
-    there = np.concatenate([observed, background], axis=1), onp.concatenate([valid_observed, next_hidden], axis=1)
-    here = np.concatenate([predicted, background], axis=1), onp.concatenate([valid_predicted, hidden], axis=1)
-    return (nearest_squared_distances(predicted, *there) * valid_predicted,
-            nearest_squared_distances(observed, *here) * valid_observed)
+    return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
+            nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
 
 
 def chamfer_loss(map_predicted, map_observed):

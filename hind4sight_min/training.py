@@ -15,7 +15,6 @@ from autograd import grad
 from autograd.tracer import getval
 
 from . import losses
-from .geometry import unproject
 from .interactions import add_depth_noise, cell_centres, cells_of, load_npz, points_and_validity, save_npz
 from .networks import Sizes, encode, forward_model, init_parameters, inverse_model, predicted_flow
 from .ops import take
@@ -36,12 +35,6 @@ class Batch:
     start_cells: onp.ndarray  # (B,) int
     end_cells: onp.ndarray
     cells: onp.ndarray       # (cells, 2) m: the centres of the arena's cells
-    background: onp.ndarray  # (B, N, 3) float32 m, arena: the empty arena
-    hidden: onp.ndarray      # (B, N) bool: the points of the empty arena that something hides in frame t
-    next_hidden: onp.ndarray
-
-
-HIDDEN = 0.008  # m nearer than the empty arena: the threshold of background subtraction, simulator.occupied_cells
 
 
 def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
@@ -58,26 +51,16 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
     depth, rgb = (onp.stack([getattr(interactions, f"{kind}_{when}")[rows] for when in ("before", "after")])
                   for kind in ("depth", "rgb"))  # (2, B, ...)
     pokes, starts = interactions.pokes[rows], interactions.starts[rows]
-    empty = onp.repeat(interactions.empty_depth[None], len(rows), axis=0)
-    for pictures in (depth[0], depth[1], rgb[0], rgb[1], empty):
-        pictures[mirror] = pictures[mirror][:, :, ::-1]
+    depth[:, mirror], rgb[:, mirror] = depth[:, mirror, :, ::-1], rgb[:, mirror, :, ::-1]
     pokes[mirror] = pokes[mirror] * [-1, 1, -1] + [0, 0, onp.pi]
     starts[mirror] *= [-1, 1]
     if depth_noise:
         depth = add_depth_noise(depth, rng, depth_noise)
-    hidden = ((depth > 0) & (empty - depth > HIDDEN)).reshape(2, len(rows), -1)
-    background = unproject(empty, camera).reshape(len(rows), -1, 3)
     points, valid = points_and_validity(depth, camera)
     points, valid = (value.reshape(2, len(rows), -1, *value.shape[4:]) for value in (points, valid))
     images = rgb.astype(onp.float32) / 255
     return Batch(*points, *valid, *images, pokes, cells_of(starts, settings), cells_of(pokes[:, :2], settings),
-                 cell_centres(settings), background, *hidden)
-
-
-def observed_maps(prediction, batch):
-    """The distance maps of Eq. (2) for a prediction, both clouds completed by what they hide of the empty arena."""
-    return losses.distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid,
-                                batch.background, batch.hidden, batch.next_hidden)
+                 cell_centres(settings))
 
 
 def loss_terms(params, sizes, batch, camera):
@@ -86,7 +69,7 @@ def loss_terms(params, sizes, batch, camera):
     next_features, next_state = encode(params, batch.next_points, batch.next_valid)
     prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes, encoding)
     flow = predicted_flow(prediction, batch.points, camera)
-    maps = observed_maps(prediction, batch)
+    maps = losses.distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid)
     heatmaps = inverse_model(params, batch.points, batch.next_points, batch.valid & batch.next_valid, encoding[0],
                              next_features, batch.cells)
     return {

@@ -257,25 +257,6 @@ def test_photometric_loss_refuses_a_flow_that_is_not_finite():
         photometric_loss(images, next_images, flow, np.ones((B, N), bool))
 
 
-def test_the_hidden_part_of_the_empty_arena_belongs_to_both_clouds():
-    # Eq. (2): brute force over each cloud and the hidden points
-    rng = np.random.default_rng(20)
-    predicted, observed, background = rng.normal(size=(3, B, N, 3))
-    valid, next_valid, hidden, next_hidden = rng.random((4, B, N)) < 0.6
-    arguments = (predicted, observed, valid, next_valid, background, hidden, next_hidden)
-    maps = distance_maps(*arguments)
-    for b in range(B):
-        for found, from_, seen, to, there, behind in (
-                (maps[0][b], predicted[b], valid[b], observed[b], next_valid[b], next_hidden[b]),
-                (maps[1][b], observed[b], next_valid[b], predicted[b], valid[b], hidden[b])):
-            everything = np.concatenate([to[there], background[b][behind]])
-            nearest = ((from_[:, None] - everything) ** 2).sum(axis=2).min(axis=1)
-            np.testing.assert_allclose(found, nearest * seen, rtol=1e-12)
-    plain = distance_maps(*arguments[:4])
-    assert (maps[0] < plain[0]).any() and (maps[1] < plain[1]).any()
-    check_grads(lambda p: chamfer_loss(*distance_maps(p, *arguments[1:])), modes=["rev"], order=1)(predicted)
-
-
 # --- smoothness: Eq. (4) and (5) --------------------------------------------------------------------------
 
 ALL = np.ones((B, N), bool)
