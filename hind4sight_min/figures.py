@@ -176,7 +176,8 @@ def _draw_heatmap(figure, axes, heatmap, which, symbol, true, arena):
                         vmax=heatmap.max() or 1, extent=(-half, half, -half, half))
     axes.plot(*true, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
               label=f"true {which}")
-    axes.legend(fontsize=9, loc="upper right", framealpha=0.85)
+    corner = "lower right" if true[1] > 0 else "upper right"  # away from the mark
+    axes.legend(fontsize=9, loc=corner, framealpha=0.85)
     _colour_bar(figure, shown, axes, "probability")
 
 
