@@ -6,9 +6,8 @@ import numpy as np
 
 from .geometry import optical_flow
 from .interactions import cell_centres, true_scene_flow
-from .networks import encode, forward_model, inverse_model, predicted_flow
 from .ops import softmax
-from .training import make_batch
+from .training import make_batch, run_model
 
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
 
@@ -16,21 +15,15 @@ MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objec
 def predict(run, interactions, rows):
     """The whole model on some rows -> (Batch, Prediction, optical flow, start heat-maps, end heat-maps)."""
     batch = make_batch(interactions, rows)
-    encoding = encode(run.params, batch.points, batch.valid)
-    next_features, _ = encode(run.params, batch.next_points, batch.next_valid)
-    prediction = forward_model(run.params, run.recipe.sizes, batch.points, batch.valid, batch.pokes, encoding)
-    flow = predicted_flow(prediction, batch.points, interactions.camera)
-    heatmaps = inverse_model(run.params, batch.points, batch.next_points, batch.valid & batch.next_valid,
-                             encoding[0], next_features, batch.cells)
+    prediction, flow, heatmaps, _ = run_model(run.params, run.recipe.sizes, batch, interactions.camera)
     return (batch, prediction, flow, *map(softmax, heatmaps))
 
 
 def poke_from_heatmaps(start_heatmaps, end_heatmaps, settings):
-    """Heat-maps (B, cells) -> pokes (B, 3): the target is the end map's best cell, the direction points there
-    from the start map's mean position, seen from the target. Paper: Sec. III-E.
+    """Heat-maps (B, cells) -> pokes (B, 3). Paper: Sec. III-E.
 
-    A best cell alone would give the direction in steps; the mean over the map of the *unit vectors* to the
-    target is finer and does not mind a wide map.
+    The target is the end map's best cell; the direction is that of the mean, over the start map, of the unit
+    vectors to the target. A best start cell would give it in steps; the mean is finer and minds no wide map.
     """
     centres = cell_centres(settings)
     target = centres[np.argmax(end_heatmaps, axis=1)]

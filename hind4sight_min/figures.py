@@ -4,7 +4,6 @@ shown, nothing is saved (but by `save_figure`), and pyplot with its global state
 Image panels show pixels as they are, (0, 0) top left. Arena panels are seen from above, in metres: x to the
 right, y up, so that the camera looks in from the lower edge.
 """
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.patheffects import Normal, withStroke
 from matplotlib.ticker import LogFormatter
+
+from .interactions import whole_file
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart: one per mask (or object).
 PALETTE = np.array([(230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178),
@@ -303,13 +304,8 @@ def save_figure(figure, path):
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name ending in .png, got {path.name!r}")
-    path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine():
         figure.get_layout_engine().execute(figure)
         figure.set_layout_engine("none")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi="figure", metadata={"Software": None})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -63,15 +63,23 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
                  cell_centres(settings))
 
 
-def loss_terms(params, sizes, batch, camera):
-    """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS."""
+def run_model(params, sizes, batch, camera):
+    """The whole model on a batch -> (Prediction, optical flow (B, H, W, 2) px, (start, end) heat-map logits,
+    observed next embedding (B, E)). Paper: Fig. 3.
+    """
     encoding = encode(params, batch.points, batch.valid)
     next_features, next_state = encode(params, batch.next_points, batch.next_valid)
     prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes, encoding)
     flow = predicted_flow(prediction, batch.points, camera)
-    maps = losses.distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid)
     heatmaps = inverse_model(params, batch.points, batch.next_points, batch.valid & batch.next_valid, encoding[0],
                              next_features, batch.cells)
+    return prediction, flow, heatmaps, next_state
+
+
+def loss_terms(params, sizes, batch, camera):
+    """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS."""
+    prediction, flow, heatmaps, next_state = run_model(params, sizes, batch, camera)
+    maps = losses.distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid)
     return {
         "chamfer": losses.chamfer_loss(*maps),
         "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,

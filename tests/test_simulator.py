@@ -898,21 +898,13 @@ def test_a_folder_with_other_data_is_refused(collected, short_shards, changed):
 
 
 @needs_bullet
-def test_too_many_shards_are_refused_even_if_an_early_one_is_missing(collected, short_shards, tmp_path):
+@pytest.mark.parametrize("missing, pokes", [(0, 10), (1, 5)])  # an early one; one that leaves a gap
+def test_too_many_shards_are_refused_even_if_one_is_missing(collected, short_shards, tmp_path, missing, pokes):
     folder = copy(collected[0], tmp_path / "again")
-    for name in ("shard_0000.npz", "shard_0000.truth.npz"):
+    for name in (f"shard_{missing:04d}.npz", f"shard_{missing:04d}.truth.npz"):
         (folder / name).unlink()
     with pytest.raises(ValueError, match="number of pokes"):
-        collect(folder, 10, 3, SMALL)  # would leave 12 pokes in the folder
-
-
-@needs_bullet
-def test_too_many_shards_are_refused_even_behind_a_gap(collected, short_shards, tmp_path):
-    folder = copy(collected[0], tmp_path / "again")
-    for name in ("shard_0001.npz", "shard_0001.truth.npz"):
-        (folder / name).unlink()
-    with pytest.raises(ValueError, match="number of pokes"):
-        collect(folder, 5, 3, SMALL)
+        collect(folder, pokes, 3, SMALL)  # would leave more of them in the folder
 
 
 @needs_bullet
