@@ -15,16 +15,18 @@ from .ops import dense_relu, max_pool, softmax, take
 
 @dataclass(frozen=True)
 class Sizes:
-    """masks: K, background included. width: units of the forward model. rounds: of context.
+    """masks: K, background included. width: units of the layers that run on every point. rounds: of context.
+    head: units of those that run once per scene or mask; they cost next to nothing.
     embedding: length of the state embedding s_t and of the encoder's features.
     """
     masks: int = 4
     width: int = 48
+    head: int = 128
     rounds: int = 2
     embedding: int = 32
 
     def __post_init__(self):
-        for name, least in (("masks", 2), ("width", 1), ("rounds", 1), ("embedding", 1)):
+        for name, least in (("masks", 2), ("width", 1), ("head", 1), ("rounds", 1), ("embedding", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
 
@@ -48,9 +50,18 @@ def fourier(values, wavelengths):
     return onp.concatenate([onp.sin(phase), onp.cos(phase)], axis=-1)
 
 
+def position_features(points, unit, wavelengths):
+    """Each point's position as a perceptron can use it, (..., 3) m -> (..., 20).
+
+    tanh(z / 1 cm) tells the table from what stands on it, by a threshold no perceptron would learn to be as sharp.
+    """
+    return onp.concatenate([points / unit, onp.tanh(points[..., 2:] / 0.01),
+                            fourier(points[..., :2], wavelengths)], axis=-1).astype(points.dtype)
+
+
 def encoder_features(points):
-    """Arena coordinates of each point, (..., 3) m -> (..., 19)."""
-    return onp.concatenate([points / 0.25, fourier(points[..., :2], (0.8, 0.4, 0.2, 0.1))], axis=-1)
+    """Position in the arena, (..., 3) m -> (..., 20)."""
+    return position_features(points, 0.25, (0.8, 0.4, 0.2, 0.1))
 
 
 def poke_axes(pokes):
@@ -67,8 +78,26 @@ def poke_frame(points, pokes):
 
 
 def poke_features(local):
-    """Poke-frame coordinates, (..., 3) m -> (..., 19)."""
-    return onp.concatenate([local / 0.1, fourier(local[..., :2], (0.4, 0.2, 0.1, 0.05))], axis=-1)
+    """Position relative to the poke, (..., 3) m in the poke frame -> (..., 20)."""
+    return position_features(local, 0.1, (0.4, 0.2, 0.1, 0.05))
+
+
+MAP_CELL = 0.02  # m
+MAP_X, MAP_Y = MAP_CELL * onp.arange(-6.5, 7), MAP_CELL * onp.arange(-4.5, 5)  # cell centres in the poke frame
+
+
+def height_map(local, valid):
+    """What the finger will meet: mean height over each cell around the target, (B, 140), in units of 3 cm.
+
+    local (B, N, 3) m, poke frame; valid (B, N) bool. A point counts for the four cells around it, bilinearly, so
+    that the map changes smoothly with the poke. A cell that no point is near reads 0.
+    """
+    across, along = (onp.maximum(0, 1 - onp.abs(local[..., axis, None] - centres) / MAP_CELL)  # (B, N, cells)
+                     for axis, centres in ((1, MAP_Y), (0, MAP_X)))
+    across, along = across * valid[..., None], onp.swapaxes(along, 1, 2)
+    count = onp.matmul(along, across)
+    total = onp.matmul(along, across * onp.maximum(local[..., 2:], 0))
+    return (total / (count + 0.2) / 0.03).reshape(len(local), -1).astype(local.dtype)
 
 
 def pooling_weights(local, valid):
@@ -91,26 +120,29 @@ def init_parameters(sizes, rng, dtype=onp.float32):
     Paper: Sec. III-G, "initializing one out of K masks to predict all pixels as background and moreover
     initializing SE(3) transformations to predict identity transform".
     """
-    params, width, embedding = {}, sizes.width, sizes.embedding
+    params, width, head, embedding = {}, sizes.width, sizes.head, sizes.embedding
 
     def layer(name, inputs, outputs, gain=2.0):
         params[name + "_w"] = (rng.standard_normal((inputs, outputs)) * onp.sqrt(gain / inputs)).astype(dtype)
         params[name + "_b"] = onp.zeros(outputs, dtype)
 
-    layer("encoder_1", 19, embedding)
+    layer("encoder_1", 20, embedding)
     layer("encoder_2", embedding, embedding)
-    layer("trunk_0", 19 + embedding, width)
+    layer("shape_1", len(MAP_X) * len(MAP_Y), head)
+    layer("shape_2", head, width)
+    layer("trunk_0", 20 + embedding, width)
     for i in range(1, sizes.rounds + 1):
         layer(f"trunk_{i}", width, width)
-        layer(f"context_{i}", 3 * width, width, gain=1.0)  # its bias is the trunk layer's
+        layer(f"context_{i}", 4 * width, width, gain=1.0)  # its bias is the trunk layer's
         del params[f"trunk_{i}_b"]
-    layer("mask", width, sizes.masks - 1, gain=0.1)
+    layer("mask", width, sizes.masks - 1, gain=0.01)
     params["mask_b"] -= 1  # background first
-    layer("motion_1", 4 * width + 3, width)
-    layer("motion_2", width, 6, gain=0.0)
-    layer("next_1", embedding + 3 * width, width)
+    layer("motion_1", 5 * width + 3, head)
+    layer("motion_2", head, head)
+    layer("motion_3", head, 6, gain=0.0)
+    layer("next_1", embedding + 4 * width, width)
     layer("next_2", width, embedding, gain=0.0)
-    layer("change", 2 * 19 + 2 * embedding, width)
+    layer("change", 2 * 20 + 2 * embedding, width)
     layer("cell_1", 18, width)
     layer("cell_context", width, width, gain=1.0)  # its bias is the next layer's
     layer("cell_2", width, width)
@@ -158,10 +190,11 @@ def forward_model(params, sizes, points, valid, pokes, encoding=None):
     features, state = encoding or encode(params, points, valid)
     local = poke_frame(points, pokes)
     pooling = pooling_weights(local, valid)
+    shape = relu(dense(params, "shape_2", relu(dense(params, "shape_1", height_map(local, valid)))))  # (B, C)
 
-    def context(h):  # (B, N, C) -> (B, 3 C)
+    def context(h):  # (B, N, C) -> (B, 4 C)
         pooled = np.reshape(np.matmul(pooling, h), (len(points), -1))
-        return np.concatenate([max_pool(h, valid), pooled], axis=1)
+        return np.concatenate([max_pool(h, valid), pooled, shape], axis=1)
 
     h = np.concatenate([poke_features(local), features], axis=2)
     h = dense_relu(h, params["trunk_0_w"], params["trunk_0_b"])
@@ -180,6 +213,12 @@ def forward_model(params, sizes, points, valid, pokes, encoding=None):
     return Prediction(predicted, masks, rotations, translations, state + dense(params, "next_2", change) / CHANGE_GAIN)
 
 
+# Of [translation, rotation], in m and rad. Adam moves every weight by the learning rate, whatever the gradient, and
+# a motion is a sum over `head` of them: with 5 cm and 1 rad the first steps fling the points about, and the masks
+# withdraw from that within a hundred steps.
+MOTION_UNIT = onp.array([0.005] * 3 + [0.1] * 3, onp.float32)
+
+
 def _motions(params, h, masks, seen, local, valid, pokes):
     """One rigid motion per mask, from the features pooled under it; the background's is the identity.
 
@@ -192,9 +231,9 @@ def _motions(params, h, masks, seen, local, valid, pokes):
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
     x = relu(dense(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2)))
-    twist = dense(params, "motion_2", x)  # (B, K-1, 6): [translation, rotation]
+    twist = MOTION_UNIT * dense(params, "motion_3", relu(dense(params, "motion_2", x)))  # (B, K-1, 6)
     turn = so3_exp(twist[..., 3:])
-    shift = centroids - _rotate(turn, centroids) + 0.05 * twist[..., :3]
+    shift = centroids - _rotate(turn, centroids) + twist[..., :3]
 
     # From the poke frame to the arena: with p_arena = Q p_poke + o, R -> Q R Q^T and T -> Q T + o - (Q R Q^T) o.
     axes, origins = (value[:, None] for value in poke_axes(pokes.astype(local.dtype)))

@@ -134,7 +134,7 @@ class Recipe:
     """
     steps: int = 3000
     batch: int = 16
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     warmup: int = 50
     ramp: tuple = (0.2, 0.6)
     depth_noise: float = 0.0

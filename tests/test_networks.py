@@ -62,7 +62,7 @@ def test_forward_model_turns_with_the_arena_except_for_its_arena_features():
     rng = np.random.default_rng(3)
     points, valid, pokes = scene(rng)
     params = random_parameters(rng)
-    params["trunk_0_w"][19:] = 0  # what comes from the encoder is tied to the arena: switch it off
+    params["trunk_0_w"][20:] = 0  # what comes from the encoder is tied to the arena: switch it off
     before = forward_model(params, SIZES, points, valid, pokes)
     turn, _ = poke_axes(np.array([[0, 0, 0.7]]))
     turned_pokes = np.column_stack([pokes[:, :2] @ turn[0, :2, :2].T, pokes[:, 2] + 0.7])
