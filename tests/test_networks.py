@@ -3,10 +3,11 @@ import pytest
 from autograd import grad
 
 from hind4sight_min import networks
-from hind4sight_min.networks import (Sizes, encode, forward_model, fourier, init_parameters, inverse_model,
-                                     most_changed, poke_axes, poke_frame, pooling_weights)
+from hind4sight_min.networks import (Sizes, encode, encoder_features, forward_model, fourier, height_map,
+                                     init_parameters, inverse_model, most_changed, poke_axes, poke_features,
+                                     poke_frame, pooling_weights)
 
-SIZES = Sizes(masks=3, width=8, rounds=2, embedding=6)
+SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6)
 
 
 def scene(rng, batch=2, count=40, dtype=np.float64):
@@ -179,6 +180,33 @@ def test_fourier_against_numpy():
     np.testing.assert_allclose(found[0], expected)
 
 
+@pytest.mark.parametrize("features, unit", [(encoder_features, 0.25), (poke_features, 0.1)])
+def test_position_features_tell_the_table_from_what_stands_on_it(features, unit):
+    points = np.array([[0.05, -0.02, 0.0], [0.05, -0.02, 0.01]], np.float32)
+    found = features(points)
+    assert found.shape == (2, 20) and found.dtype == np.float32
+    np.testing.assert_allclose(found[:, :3], points / unit, rtol=1e-6)
+    np.testing.assert_allclose(found[:, 3], [0, np.tanh(1.0)], rtol=1e-6)
+    np.testing.assert_array_equal(found[0, 4:], found[1, 4:])  # the waves are of x and y alone
+
+
+def test_height_map_against_a_loop_over_points():
+    rng = np.random.default_rng(10)
+    local = rng.uniform(-0.18, 0.18, (2, 200, 3))
+    valid = rng.random((2, 200)) < 0.8
+    count, total = np.zeros((2, 14, 10)), np.zeros((2, 14, 10))
+    for b, n in np.argwhere(valid):
+        x, y = local[b, n, 0] / 0.02 + 6.5, local[b, n, 1] / 0.02 + 4.5  # in cells
+        for i in (int(np.floor(x)), int(np.floor(x)) + 1):
+            for j in (int(np.floor(y)), int(np.floor(y)) + 1):
+                if 0 <= i < 14 and 0 <= j < 10:
+                    share = (1 - abs(x - i)) * (1 - abs(y - j))
+                    count[b, i, j] += share
+                    total[b, i, j] += share * max(local[b, n, 2], 0)
+    assert (count == 0).any() and (total > 0).any()
+    np.testing.assert_allclose(height_map(local, valid), (total / (count + 0.2) / 0.03).reshape(2, 140), atol=1e-12)
+
+
 def test_pooling_weights_look_at_the_target_and_along_the_path():
     local = np.array([[[0, 0, 0.03], [-0.1, 0, 0.03], [0.1, 0.1, 0.03], [0, 0, 0.0]]])
     near, path = pooling_weights(local, np.ones((1, 4), bool))[0]
@@ -187,7 +215,7 @@ def test_pooling_weights_look_at_the_target_and_along_the_path():
     assert path[2] == 0
 
 
-@pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("rounds", 0), ("embedding", 0)])
+@pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("head", 0), ("rounds", 0), ("embedding", 0)])
 def test_impossible_sizes(name, value):
     with pytest.raises(ValueError, match=name):
         Sizes(**{name: value})
