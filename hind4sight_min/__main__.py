@@ -87,7 +87,7 @@ def show_row(run, interactions, row, truth, path):
     shape = (camera.height, camera.width)
     batch, prediction, flow, start_heatmap, end_heatmap = evaluation.predict(run, interactions, np.array([row]))
     warped, _ = warp_backward(batch.next_images, flow)
-    maps = distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid)
+    maps = distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared)
     points = batch.points[0].reshape(*shape, 3)
     poke, start = interactions.pokes[row], interactions.starts[row]
     ends = np.array([[*start, 0], [*poke[:2], 0]], np.float32)

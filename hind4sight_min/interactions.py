@@ -88,6 +88,14 @@ def points_and_validity(depth, camera):
     return unproject(depth, camera), depth > 0
 
 
+def occupied_pixels(depth, empty_depth, threshold=0.008):
+    """Background subtraction: (..., H, W) bool, where something stands in the arena. Paper: Sec. IV-A.
+
+    depth, empty_depth (..., H, W) m. A pixel counts when it is nearer than the empty arena by more than `threshold` m.
+    """
+    return (depth > 0) & (empty_depth > 0) & (empty_depth - depth > threshold)
+
+
 def rotation_from_quaternion(quaternions):
     """Unit quaternions (..., 4), (x, y, z, w) as in Bullet -> rotation matrices (..., 3, 3)."""
     x, y, z, w = np.moveaxis(np.asarray(quaternions, float), -1, 0)

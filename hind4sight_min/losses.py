@@ -15,6 +15,18 @@ from .ops import bilinear_sample, nearest_squared_distances, take
 EDGE_SHARPNESS = 40.0
 
 
+def seen_in_both(valid, next_valid, occupied, next_occupied):
+    """Which points of each frame have a counterpart in the other: the `valid` of Eq. 2, 3 and 5.
+
+    Not in the paper. Where a pixel shows the table in one frame and an object in the other, the object covers or
+    uncovers that bit of table, and one of the clouds lacks it. Compared all the same, it makes most of the Chamfer
+    distance of the true flow, and dragging the table along with the object is the cheapest way out.
+    valid, next_valid: pixels with depth; occupied, next_occupied: pixels nearer than the empty arena; all (B, N) bool
+    -> two (B, N) bool.
+    """
+    return valid & (occupied | ~next_occupied), next_valid & (next_occupied | ~occupied)
+
+
 # --- 3D -----------------------------------------------------------------------------------------------
 
 def distance_maps(predicted, observed, valid_predicted, valid_observed):

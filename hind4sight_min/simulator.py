@@ -17,7 +17,7 @@ import numpy as np
 
 from .geometry import Camera, look_at, unproject
 from .interactions import (Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
-                           save_shard, truth_path)
+                           occupied_pixels, save_shard, truth_path)
 from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
 
 MAX_OBJECTS = 7
@@ -333,15 +333,13 @@ class Arena:
 
 
 def occupied_cells(depth, empty_depth, camera, settings, threshold=0.008):
-    """Background subtraction: which cells of the arena's grid hold something. Paper: Sec. IV-A.
+    """Which cells of the arena's grid hold something: those of occupied pixels inside the walls. Paper: Sec. IV-A.
 
-    depth, empty_depth (H, W) m -> (rows, columns) bool. A pixel counts when it is nearer to the camera than
-    the empty arena by more than `threshold` m and its point lies inside the walls.
+    depth, empty_depth (H, W) m; threshold: of `occupied_pixels`, m -> (rows, columns) bool.
     """
-    valid = (depth > 0) & (empty_depth > 0)
     points = unproject(depth, camera)
     inside = np.abs(points[..., :2]).max(axis=-1) < settings["arena"] / 2
-    changed = valid & inside & (empty_depth - depth > threshold)
+    changed = inside & occupied_pixels(depth, empty_depth, threshold)
     occupied = np.zeros(grid_shape(settings), bool)
     occupied.ravel()[cells_of(points[changed][:, :2], settings)] = True
     return occupied

@@ -15,7 +15,8 @@ from autograd import grad
 from autograd.tracer import getval
 
 from . import losses
-from .interactions import add_depth_noise, cell_centres, cells_of, load_npz, points_and_validity, save_npz
+from .interactions import (add_depth_noise, cell_centres, cells_of, load_npz, occupied_pixels, points_and_validity,
+                           save_npz)
 from .networks import Sizes, encode, forward_model, init_parameters, inverse_model, predicted_flow
 from .ops import take
 
@@ -27,8 +28,10 @@ class Batch:
     """B interactions as the losses want them: organised clouds, float images, pokes and their two cells."""
     points: onp.ndarray       # (B, N, 3) float32 m, arena, frame t
     next_points: onp.ndarray  # (B, N, 3), frame t+1
-    valid: onp.ndarray        # (B, N) bool
+    valid: onp.ndarray        # (B, N) bool: has depth
     next_valid: onp.ndarray
+    shared: onp.ndarray       # (B, N) bool: valid and seen in both frames, see losses.seen_in_both
+    next_shared: onp.ndarray
     images: onp.ndarray       # (B, H, W, 3) float32 in [0, 1]
     next_images: onp.ndarray
     pokes: onp.ndarray        # (B, 3) float32
@@ -58,8 +61,10 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
         depth = add_depth_noise(depth, rng, depth_noise)
     points, valid = points_and_validity(depth, camera)
     points, valid = (value.reshape(2, len(rows), -1, *value.shape[4:]) for value in (points, valid))
+    empty = onp.where(mirror[:, None, None], interactions.empty_depth[:, ::-1], interactions.empty_depth)
+    shared = losses.seen_in_both(*valid, *occupied_pixels(depth, empty).reshape(valid.shape))
     images = rgb.astype(onp.float32) / 255
-    return Batch(*points, *valid, *images, pokes, cells_of(starts, settings), cells_of(pokes[:, :2], settings),
+    return Batch(*points, *valid, *shared, *images, pokes, cells_of(starts, settings), cells_of(pokes[:, :2], settings),
                  cell_centres(settings))
 
 
@@ -79,12 +84,12 @@ def run_model(params, sizes, batch, camera):
 def loss_terms(params, sizes, batch, camera):
     """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS."""
     prediction, flow, heatmaps, next_state = run_model(params, sizes, batch, camera)
-    maps = losses.distance_maps(prediction.points, batch.next_points, batch.valid, batch.next_valid)
+    maps = losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared)
     return {
         "chamfer": losses.chamfer_loss(*maps),
         "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
-                                                               batch.valid, batch.next_valid),
-        "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.valid),
+                                                               batch.shared, batch.next_shared),
+        "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
         "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
         "inverse": losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells,
                                        prediction.embedding, next_state),
