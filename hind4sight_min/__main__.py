@@ -100,7 +100,8 @@ def show_row(run, interactions, row, truth, path):
         optical_flow=flow[0], warped=warped[0], distance_predicted=maps[0][0].reshape(shape),
         distance_observed=maps[1][0].reshape(shape), start_heatmap=start_heatmap.reshape(interactions.grid_shape),
         end_heatmap=end_heatmap.reshape(interactions.grid_shape), arena=settings["arena"], poke=poke, start=start,
-        poke_pixels=project(ends, camera), valid=batch.valid[0].reshape(shape), true_scene_flow=true,
+        poke_pixels=project(ends, camera), valid=batch.valid[0].reshape(shape),
+        shared=batch.shared[0].reshape(shape), true_scene_flow=true,
         true_optical_flow=evaluation.optical_flow(points, points + true, camera),
         true_labels=np.where(np.isin(labels, moved), labels, 0))
     figures.save_figure(figure, path)

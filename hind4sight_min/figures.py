@@ -146,12 +146,12 @@ def _draw_flows(panels, flows):
     axes.text(0.72, 0.97, f"rim:\n{scale:.1f} px", fontsize=9, ha="right", va="top", transform=axes.transAxes)
 
 
-def _draw_error(figure, axes, image, warped, flow, valid):
-    """The photometric error of each pixel; grey where the flow leaves the picture or there is no depth."""
-    (height, width), margin = valid.shape, 0.01  # px: rounding alone carries no pixel of the rim out of view
+def _draw_error(figure, axes, image, warped, flow, shared):
+    """The photometric error of each pixel; grey where the flow leaves the picture or the pixel is not `shared`."""
+    (height, width), margin = shared.shape, 0.01  # px: rounding alone carries no pixel of the rim out of view
     v, u = np.mgrid[:height, :width]
     x, y = u + flow[..., 0], v + flow[..., 1]
-    counted = valid & (x > -margin) & (x < width - 1 + margin) & (y > -margin) & (y < height - 1 + margin)
+    counted = shared & (x > -margin) & (x < width - 1 + margin) & (y > -margin) & (y < height - 1 + margin)
     error = np.abs(image - warped).sum(axis=-1)  # Eq. (3) before the sum over pixels
     shown = _show(axes, np.ma.array(error, mask=~counted), "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\n"
                   "grey: not counted", cmap=MAGMA, vmin=0, vmax=max(0.1, (error * counted).max()))
@@ -196,7 +196,7 @@ def _layout(images):
 
 def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_flow, warped, distance_predicted,
                        distance_observed, start_heatmap, end_heatmap, arena, poke, start, poke_pixels, valid=None,
-                       true_scene_flow=None, true_optical_flow=None, true_labels=None, title=None):
+                       shared=None, true_scene_flow=None, true_optical_flow=None, true_labels=None, title=None):
     """One interaction: what was seen, what the model says of it, and what the losses see of that. -> Figure
 
     Paper: the quantities of Fig. 3 and 4 (Eq. 1-3, Sec. III-C and III-E), for one poke.
@@ -205,9 +205,10 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
     distance_predicted, distance_observed (H, W) m^2: D_{P'->P} on frame t's grid, D_{P->P'} on frame t+1's.
     start_heatmap, end_heatmap (rows, columns), rows along y: A_t, B_t. arena: the arena's side in m.
     poke (3,), (m, m, rad). start (2,) m. poke_pixels (2, 2) px: the poke's start and target in the image.
-    Optional: valid (H, W) bool, pixels with depth (default all); the flow and the photometric error of others
-    are left out. true_scene_flow (H, W, 3) m, true_optical_flow (H, W, 2) px. true_labels (H, W) int: 0, or
-    the number of the object that moved there. title: replaces the one that tells the poke.
+    Optional: valid (H, W) bool, pixels with depth (default all); the flow of others is left out. shared (H, W)
+    bool: pixels whose photometric error counts (default valid). true_scene_flow (H, W, 3) m, true_optical_flow
+    (H, W, 2) px. true_labels (H, W) int: 0, or the number of the object that moved there. title: replaces the one
+    that tells the poke.
     Each panel's Axes carry their name as label. A mask's colour is its place in PALETTE.
     Raises ValueError naming the argument for a wrong shape, a number that is not finite or out of its range.
     """
@@ -226,6 +227,7 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
     if not (np.isfinite(arena) and arena > 0):
         raise ValueError(f"arena: expected a finite number of metres > 0, got {arena}")
     valid = np.ones(size, bool) if valid is None else _checked("valid", valid, *size) > 0
+    shared = valid if shared is None else valid & (_checked("shared", shared, *size) > 0)
 
     flows = [("flow", "Predicted optical flow\n(U, V), Sec. III-C", optical_flow * valid[..., None])]
     arrows = [(scene_flow[valid], PREDICTED, 0.013, "predicted")]
@@ -250,7 +252,7 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
         _show(panels["labels"], _blend(image, moved.astype(float)), "True objects that moved\n(colours of their own)")
     _draw_flows(panels, flows)
     _show(panels["warped"], np.clip(warped, 0, 1), "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
-    _draw_error(figure, panels["error"], image, warped, optical_flow, valid)
+    _draw_error(figure, panels["error"], image, warped, optical_flow, shared)
     _draw_distances(figure, [panels["distance_predicted"], panels["distance_observed"]], maps)
     _arena_panel(panels["scene_flow"], "Scene flow from above (Eq. 1)")
     _draw_scene_flow(panels["scene_flow"], image[valid], points[valid], arrows, start, poke[:2], arena)

@@ -143,6 +143,11 @@ def test_error_is_not_drawn_where_it_is_not_counted():
     flow[4, W - 1] = [1e-6, 0.0]  # rounding
     mask = np.ma.getmaskarray(picture(panels(interaction_figure(**example(valid=valid, optical_flow=flow)))["error"]))
     assert np.argwhere(mask).tolist() == [[0, 0], [0, 4], [2, 0], [3, W - 1], [H - 1, 4]]
+    shared = np.ones((H, W), bool)
+    shared[1, 2] = False
+    drawn = panels(interaction_figure(**example(valid=valid, shared=shared, optical_flow=flow)))
+    assert np.argwhere(np.ma.getmaskarray(picture(drawn["error"]))).tolist() == [
+        [0, 0], [0, 4], [1, 2], [2, 0], [3, W - 1], [H - 1, 4]]
 
 
 def test_flow_without_depth_neither_shows_nor_sets_the_scale():
@@ -217,7 +222,7 @@ def test_title():
 ARRAYS = [name for name in example(truth=True) if name != "arena"]
 
 
-@pytest.mark.parametrize("name", [*ARRAYS, "valid"])
+@pytest.mark.parametrize("name", [*ARRAYS, "valid", "shared"])
 def test_a_wrong_shape_is_named(name):
     with pytest.raises(ValueError, match=f"^{name}: expected shape .*got \\(2, 3, 4, 5\\)"):
         interaction_figure(**example(truth=True, **{name: np.zeros((2, 3, 4, 5))}))

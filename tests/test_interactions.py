@@ -12,8 +12,8 @@ from scipy.stats import chisquare
 from hind4sight_min.geometry import Camera, look_at, unproject
 from hind4sight_min.interactions import (DEPTH_UNIT, FORMAT, Interactions, Truth, add_depth_noise, associate_with_noise,
                                          cell_centres, cells_of, grid_shape, load_interactions, load_npz, load_shard,
-                                         load_truth, points_and_validity, rotation_from_quaternion, save_npz,
-                                         save_shard, shards_in, true_scene_flow, truth_path)
+                                         load_truth, occupied_pixels, points_and_validity, rotation_from_quaternion,
+                                         save_npz, save_shard, shards_in, true_scene_flow, truth_path)
 
 WIDTH, HEIGHT = 8, 6
 SETTINGS = {"arena": 0.5, "cell": 0.025}
@@ -74,6 +74,13 @@ def random_poses(rng):
 
 
 # --- round trip -------------------------------------------------------------------------------------------
+
+def test_occupied_pixels_are_nearer_than_the_empty_arena_and_have_depth():
+    empty = np.array([[0.7, 0.7, 0.7, 0.7, 0.7, 0.0]], np.float32)
+    depth = np.array([[0.7, 0.693, 0.691, 0.75, 0.0, 0.6]], np.float32)
+    assert occupied_pixels(depth, empty).tolist() == [[False, False, True, False, False, False]]
+    assert occupied_pixels(depth, empty, threshold=0.005).tolist() == [[False, True, True, False, False, False]]
+
 
 def test_shard_round_trip(tmp_path):
     saved, truth = make_interactions(), make_truth()

@@ -10,7 +10,7 @@ from scipy.special import log_softmax, softmax
 from hind4sight_min import losses
 from hind4sight_min.losses import (PAPER_WEIGHTS, chamfer_loss, distance_maps, distance_smoothness_loss,
                                    edge_aware_smoothness, edge_weights, embedding_loss, flow_smoothness_loss, full_loss,
-                                   heatmap_cross_entropy, inverse_loss, photometric_loss, warp_backward)
+                                   heatmap_cross_entropy, inverse_loss, photometric_loss, seen_in_both, warp_backward)
 
 B, H, W = 2, 4, 6
 N = H * W
@@ -24,6 +24,38 @@ def pulled_back(function, argnum, g, *args):
 def clouds(rng, share=1.0):
     return (rng.normal(size=(B, N, 3)), rng.normal(size=(B, N, 3)), rng.random((B, N)) < share,
             rng.random((B, N)) < share)
+
+
+# --- what is compared at all --------------------------------------------------------------------------------
+
+def test_seen_in_both_leaves_out_the_table_that_the_other_frame_hides():
+    every = np.array(np.meshgrid(*[[False, True]] * 4)).reshape(4, 1, -1)  # all 16 cases, as one row of pixels
+    shared, next_shared = seen_in_both(*every)
+    for i, (valid, next_valid, occupied, next_occupied) in enumerate(every[:, 0].T):
+        assert shared[0, i] == (valid and not (next_occupied and not occupied))
+        assert next_shared[0, i] == (next_valid and not (occupied and not next_occupied))
+
+
+def test_chamfer_of_the_true_flow_is_zero_and_dragging_the_table_does_not_pay():
+    # A row of pixels 1 cm apart; a block 5 cm high on pixels 5 to 8 is pushed on by 3.
+    def cloud(first):
+        points, occupied = np.zeros((1, 20, 3)), np.zeros((1, 20), bool)
+        points[0, :, 0] = 0.01 * np.arange(20)
+        occupied[0, first:first + 4] = True
+        points[..., 2] = 0.05 * occupied
+        return points, occupied
+    (before, occupied), (after, next_occupied) = cloud(5), cloud(8)
+    push = np.array([0.03, 0, 0])
+    true = before + push * occupied[..., None]
+    dragged = true.copy()
+    dragged[0, 9:12] += push  # the table in front of the block, and that behind it into its place
+    dragged[0, 2:5] += push
+    valid = np.ones((1, 20), bool)
+    shared = seen_in_both(valid, valid, occupied, next_occupied)
+    plain, compared = ([chamfer_loss(*distance_maps(flow, after, *masks))[0] for flow in (true, dragged)]
+                       for masks in ((valid, valid), shared))
+    assert plain[0] > 0.001 and plain[1] < plain[0]  # without it the wrong flow wins
+    assert compared[0] < 1e-12 and compared[1] >= compared[0]
 
 
 # --- 3D: Eq. (2) ------------------------------------------------------------------------------------------

@@ -164,6 +164,10 @@ def test_the_mirrored_batch_is_the_mirrored_world():
         there = getattr(mirrored, name).reshape(3, 12, 16, 3)[:, :, ::-1] * flip
         np.testing.assert_allclose(there, getattr(plain, name).reshape(3, 12, 16, 3), atol=1e-6)
     np.testing.assert_array_equal(mirrored.images[:, :, ::-1], plain.images)
+    for name in ("shared", "next_shared"):
+        flags = getattr(plain, name).reshape(3, 12, 16)
+        np.testing.assert_array_equal(getattr(mirrored, name).reshape(3, 12, 16)[:, :, ::-1], flags)
+        assert not np.array_equal(flags, flags[:, :, ::-1])
     np.testing.assert_allclose(mirrored.pokes[:, :2], plain.pokes[:, :2] * [-1, 1])
     for f, sign in ((np.cos, -1), (np.sin, 1)):
         np.testing.assert_allclose(f(mirrored.pokes[:, 2]), sign * f(plain.pokes[:, 2]), atol=1e-6)
@@ -190,6 +194,14 @@ def test_batch_against_the_data():
     assert (~batch.valid).sum() == 1 and not batch.valid[0, 3 * 16 + 4] and batch.next_valid.all()
     np.testing.assert_allclose(batch.next_images, data.rgb_after[[1, 4]] / 255, atol=1e-7)
     assert batch.points.dtype == batch.images.dtype == batch.pokes.dtype == np.float32
+    for i, row in enumerate((1, 4)):
+        for k in range(12 * 16):
+            before, after = data.depth_before[row].ravel()[k], data.depth_after[row].ravel()[k]
+            empty = data.empty_depth.ravel()[k]
+            stands, will_stand = 0 < before < empty - 0.008, 0 < after < empty - 0.008
+            assert batch.shared[i, k] == (before > 0 and not (will_stand and not stands))
+            assert batch.next_shared[i, k] == (after > 0 and not (stands and not will_stand))
+    assert 0 < (~batch.shared).sum() < 30 and 0 < (~batch.next_shared).sum() < 30
 
 
 def test_mirroring_needs_a_symmetric_camera():
