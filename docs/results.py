@@ -1,10 +1,12 @@
 """Recorded results: run a command, keep its figures with where they came from, and put them into the README.
 
     python docs/results.py record shipped -- hind4sight evaluate
+    python docs/results.py ship runs/shipped.npz
     python docs/results.py summary
 
 `record NAME -- COMMAND` runs COMMAND with `--json` added and writes docs/results/NAME.json: the figures, the
-command, commit, versions, machine and duration. `summary` gathers the headline figures of all recorded results
+command, commit, versions, machine and duration. `ship CHECKPOINT` makes the checkpoint of the recorded result
+`training` the shipped one: without the optimiser's state, with its command and commit inside. `summary` gathers the headline figures of all recorded results
 in docs/results/summary.json and writes the README's table from them; a test fails while the README says
 anything else.
 """
@@ -19,6 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from hind4sight_min.__main__ import write_text
+from hind4sight_min.training import load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"
@@ -70,6 +73,16 @@ def record(name, command):
     write_text(RESULTS / f"{name}.json", json.dumps(result, indent=2, sort_keys=True) + "\n")
 
 
+def ship(checkpoint, target=ROOT / "data_small" / "checkpoint.npz"):
+    """Write a finished checkpoint in the form that is shipped."""
+    run = load_run(checkpoint)
+    if run.step < run.recipe.steps:
+        raise ValueError(f"{checkpoint}: training stopped at step {run.step} of {run.recipe.steps}")
+    training = json.loads((RESULTS / "training.json").read_text())
+    run.meta.update(command=training["command"], commit=training["commit"])
+    save_run(target, run, resumable=False)
+
+
 def gather():
     """The headline figures that have been recorded -> flat dict."""
     found = {}
@@ -100,6 +113,8 @@ def readme_with(text, summary):
 def main(arguments):
     if arguments[:1] == ["record"] and len(arguments) > 3 and arguments[2] == "--":
         record(arguments[1], arguments[3:])
+    elif arguments[:1] == ["ship"] and len(arguments) == 2:
+        ship(arguments[1])
     elif arguments == ["summary"]:
         summary = gather()
         write_text(RESULTS / "summary.json", json.dumps(summary, indent=2, sort_keys=True) + "\n")

@@ -2,7 +2,8 @@
 
 Shapes: B interactions, H, W the picture, N = H * W points, row by row, so a map (B, N) is a picture (B, H, W).
 Every loss returns (B,): the sum over pixels as printed in the paper, per interaction; training averages
-over the batch. `valid` (B, N) marks pixels with depth: the others neither attract nor cost anything.
+over the batch. `valid` (B, N) marks the pixels that count: the others neither attract nor cost anything. In
+training these are the pixels with depth that both frames show (`seen_in_both`); flow is smooth wherever there is depth.
 """
 import autograd.numpy as np
 import numpy as onp

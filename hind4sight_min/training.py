@@ -254,6 +254,25 @@ def workers(jobs):
         yield lambda arguments: [job.result() for job in [pool.submit(chunk_gradient, *each) for each in arguments]]
 
 
+def training_step(interactions, run, gradients):
+    """One Adam step on the run's next batch; `gradients` comes from `workers`. Adds the batch's terms to run.sums.
+
+    Raises FloatingPointError if the gradient is not finite; the run is then as it was.
+    """
+    recipe = run.recipe
+    rows, mirror, rng = rows_of_step(recipe, len(interactions), run.step)
+    weights, rate = weights_at(recipe, run.step), learning_rate(recipe, run.step)
+    parts = gradients([(interactions[rows[i:i + CHUNK]], mirror[i:i + CHUNK], rng.integers(2 ** 32), weights,
+                        run.vector, run.layout, recipe) for i in range(0, recipe.batch, CHUNK)])
+    gradient = sum(part[1] for part in parts)
+    if not onp.isfinite(gradient).all():
+        raise FloatingPointError(f"the gradient is not finite at step {run.step}")
+    adam_step(run, gradient, rate)
+    for terms, _ in parts:
+        for name, value in terms.items():
+            run.sums[name] = run.sums.get(name, 0.0) + value
+
+
 def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
     """Go on with a run to its recipe's last step; updates and returns it.
 
@@ -268,17 +287,8 @@ def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
     recipe, per_epoch = run.recipe, max(1, len(interactions) // run.recipe.batch)
     with workers(min(jobs, -(-recipe.batch // CHUNK))) as gradients:
         while run.step < recipe.steps:
-            rows, mirror, rng = rows_of_step(recipe, len(interactions), run.step)
-            weights, rate = weights_at(recipe, run.step), learning_rate(recipe, run.step)
-            parts = gradients([(interactions[rows[i:i + CHUNK]], mirror[i:i + CHUNK], rng.integers(2 ** 32), weights,
-                                run.vector, run.layout, recipe) for i in range(0, recipe.batch, CHUNK)])
-            gradient = sum(part[1] for part in parts)
-            if not onp.isfinite(gradient).all():
-                raise FloatingPointError(f"the gradient is not finite at step {run.step}")
-            adam_step(run, gradient, rate)
-            for terms, _ in parts:
-                for name, value in terms.items():
-                    run.sums[name] = run.sums.get(name, 0.0) + value
+            rate = learning_rate(recipe, run.step)
+            training_step(interactions, run, gradients)
             if run.step % per_epoch == 0 or run.step == recipe.steps:
                 first = run.log[-1]["step"] if run.log else 0
                 run.log.append({"epoch": len(run.log) + 1, "step": run.step, "learning_rate": rate,

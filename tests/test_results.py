@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from hind4sight_min.training import load_run, save_run
+
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
 spec = importlib.util.spec_from_file_location("results", ROOT / "docs" / "results.py")
@@ -20,6 +22,21 @@ def test_summary_is_made_of_the_recorded_results():
     assert {"demo_flow_mse_ratio", "demo_seconds", "shipped_flow_mse_ratio", "collect_share_in_bullet",
             "collect_jobs2_speedup"} <= set(summary)
     assert all(isinstance(value, float) for value in summary.values())
+
+
+def test_the_shipped_checkpoint_says_how_it_was_trained(tmp_path):
+    shipped = ROOT / "data_small" / "checkpoint.npz"
+    run, recorded = load_run(shipped), json.loads((ROOT / "docs" / "results" / "training.json").read_text())
+    assert (run.meta["command"], run.meta["commit"]) == (recorded["command"], recorded["commit"])
+    assert run.step == run.recipe.steps == recorded["figures"]["loss_step"]
+    results.ship(shipped, tmp_path / "again.npz")
+    again = load_run(tmp_path / "again.npz")
+    assert (again.vector == run.vector).all() and again.recipe == run.recipe and not again.first_moment.any()
+    run.step -= 1
+    save_run(tmp_path / "unfinished.npz", run)
+    with pytest.raises(ValueError, match="stopped at step"):
+        results.ship(tmp_path / "unfinished.npz", tmp_path / "never.npz")
+    assert not (tmp_path / "never.npz").exists()
 
 
 def test_readme_says_what_the_summary_says():

@@ -1,0 +1,220 @@
+"""The same model and losses in PyTorch (CPU): what most readers would write instead.
+
+Only for the benchmarks; tests/test_twin.py holds it to our losses and gradients. Everything is written the way
+PyTorch users do (autograd, batched kernels, `grid_sample`); only Chamfer has two forms, of which the faster counts:
+brute force on all pairs, and SciPy's KD-tree for the indices.
+"""
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.spatial import cKDTree
+
+from hind4sight_min import networks
+from hind4sight_min.losses import EDGE_SHARPNESS
+
+
+def tensors(batch):
+    """A training.Batch as a dict of tensors."""
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in vars(batch).items()}
+
+
+# --- the network ----------------------------------------------------------------------------------------------
+
+def fourier(values, wavelengths):
+    phase = (values[..., None] * (2 * math.pi / torch.tensor(wavelengths, dtype=values.dtype))).flatten(-2)
+    return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+def position_features(points, unit, wavelengths):
+    return torch.cat([points / unit, torch.tanh(points[..., 2:] / 0.01), fourier(points[..., :2], wavelengths)], dim=-1)
+
+
+def encoder_features(points):
+    return position_features(points, 0.25, (0.8, 0.4, 0.2, 0.1))
+
+
+def poke_features(local):
+    return position_features(local, 0.1, (0.4, 0.2, 0.1, 0.05))
+
+
+def height_map(local, valid):
+    across, along = ((1 - (local[..., axis, None] - torch.from_numpy(centres).to(local)).abs() / networks.MAP_CELL)
+                     .clamp(min=0) for axis, centres in ((1, networks.MAP_Y), (0, networks.MAP_X)))
+    across, along = across * valid[..., None], along.transpose(1, 2)
+    return (along @ (across * local[..., 2:].clamp(min=0)) / (along @ across + 0.2) / 0.03).flatten(1)
+
+
+def poke_axes(pokes):
+    c, s, zero = pokes[:, 2].cos(), pokes[:, 2].sin(), torch.zeros_like(pokes[:, 2])
+    axes = torch.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], dim=-1).reshape(-1, 3, 3)
+    return axes, torch.stack([pokes[:, 0], pokes[:, 1], zero], dim=-1)
+
+
+def pooling_weights(local, valid):
+    x, y, z = local.unbind(-1)
+    near = torch.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
+    path = torch.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
+    weights = torch.stack([near, path], dim=1) * (valid & (z > 0.005))[:, None]
+    return weights / (weights.sum(dim=2, keepdim=True) + 1e-6)
+
+
+def linear(p, name, x):
+    return x @ p[name + "_w"] + p[name + "_b"]
+
+
+def encode(p, points, valid):
+    x = torch.relu(linear(p, "encoder_1", encoder_features(points)))
+    x = torch.relu(linear(p, "encoder_2", x))
+    return x, (x * valid[..., None]).sum(dim=1) / valid.sum(dim=1, keepdim=True).clamp(min=1)
+
+
+def so3_exp(w):
+    square = (w * w).sum(dim=-1)
+    small = square < 1e-4
+    t = torch.where(small, torch.ones_like(square), square).sqrt()
+    a = torch.where(small, 1 - square / 6 + square ** 2 / 120, t.sin() / t)
+    b = torch.where(small, 0.5 - square / 24 + square ** 2 / 720, 2 * (t / 2).sin() ** 2 / t ** 2)
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*w.shape[:-1], 3, 3)
+    return torch.eye(3, dtype=w.dtype) + a[..., None, None] * cross + b[..., None, None] * (cross @ cross)
+
+
+def forward_model(p, sizes, points, valid, pokes, features, state):
+    """-> predicted points, masks, next embedding; networks.forward_model."""
+    axes, origins = poke_axes(pokes)
+    local = (points - origins[:, None]) @ axes
+    pooling = pooling_weights(local, valid)
+    shape = torch.relu(linear(p, "shape_2", torch.relu(linear(p, "shape_1", height_map(local, valid)))))
+
+    def context(h):
+        return torch.cat([(h * valid[..., None]).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
+
+    h = torch.relu(linear(p, "trunk_0", torch.cat([poke_features(local), features], dim=2)))
+    for i in range(1, sizes.rounds + 1):
+        h = h + torch.relu(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
+    seen = context(h)
+    movers = networks.MASK_BOUND * torch.tanh(linear(p, "mask", h) / networks.MASK_BOUND)
+    masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)
+
+    moving = masks[..., 1:] * valid[..., None]
+    share = (moving / (moving.sum(dim=1, keepdim=True) + 1e-3)).transpose(1, 2)
+    pooled, centroids = share @ h, share @ local
+    x = torch.cat([pooled, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1], dim=2)
+    x = torch.relu(linear(p, "motion_2", torch.relu(linear(p, "motion_1", x))))
+    twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", x)
+    turn = so3_exp(twist[..., 3:])
+    shift = centroids - (turn @ centroids[..., None])[..., 0] + twist[..., :3]
+    axes, origins = axes[:, None], origins[:, None]
+    rotations = axes @ turn @ axes.transpose(2, 3)
+    translations = (axes @ shift[..., None])[..., 0] + origins - (rotations @ origins[..., None])[..., 0]
+    motions = torch.cat([rotations.flatten(2), translations], dim=2)
+    still = F.pad(torch.eye(3, dtype=points.dtype).flatten(), (0, 3)).expand(len(points), 1, 12)
+    blended = masks @ torch.cat([still, motions], dim=1)
+    predicted = (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:]
+
+    change = torch.relu(linear(p, "next_1", torch.cat([state, seen], dim=1)))
+    return predicted, masks, state + linear(p, "next_2", change) / networks.CHANGE_GAIN
+
+
+def inverse_model(p, points, next_points, valid, features, next_features, cells):
+    change = ((next_points - points) ** 2).sum(dim=2) ** 2 * valid
+    weights, rows = change.topk(min(networks.CHANGED_POINTS, change.shape[1]), dim=1)
+    weights = weights / (weights.sum(dim=1, keepdim=True) + torch.finfo(points.dtype).tiny)
+    pick = (torch.arange(len(points))[:, None], rows)
+    before, after = points[pick], next_points[pick]
+    centre = (weights[..., None] * (before + after)).sum(dim=1) / 2
+    centre = torch.cat([centre[:, :2], torch.zeros_like(centre[:, 2:])], dim=1)
+    x = torch.cat([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
+                   features[pick], next_features[pick]], dim=2)
+    context = (weights[:, None] @ torch.relu(linear(p, "change", x)))[:, 0]
+    local = (cells - centre[:, None, :2]).to(points.dtype)
+    y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
+    y = torch.relu(linear(p, "cell_1", y))
+    y = torch.relu(y @ p["cell_2_w"] + linear(p, "cell_context", context)[:, None])
+    return linear(p, "heatmaps", y).unbind(-1)
+
+
+# --- the losses -------------------------------------------------------------------------------------------------
+
+def nearest_by_brute_force(queries, references, valid):
+    """Index of every query's nearest valid reference, from the full matrix of distances."""
+    distances = torch.cdist(queries, references)
+    return distances.masked_fill(~valid[:, None], math.inf).argmin(dim=2)
+
+
+def nearest_by_tree(queries, references, valid):
+    """The same by SciPy's KD-trees."""
+    result = np.empty(queries.shape[:2], int)
+    for i, (q, r, v) in enumerate(zip(queries.numpy(), references.numpy(), valid.numpy())):
+        rows = np.flatnonzero(v)
+        result[i] = rows[cKDTree(r[rows], compact_nodes=False, balanced_tree=False).query(q)[1]]
+    return torch.from_numpy(result)
+
+
+def distance_map(queries, references, valid, weights, nearest):
+    with torch.no_grad():
+        indices = nearest(queries.detach(), references.detach(), valid)
+    found = torch.gather(references, 1, indices[..., None].expand(-1, -1, 3))
+    return ((queries - found) ** 2).sum(dim=2) * weights
+
+
+def project(points, camera):
+    matrix = torch.from_numpy(camera.camera_from_arena).to(points.dtype)
+    points = points @ matrix[:3, :3].T + matrix[:3, 3]
+    focal = torch.tensor([camera.fx, camera.fy], dtype=points.dtype)
+    return points[..., :2] / points[..., 2:].clamp(min=0.05) * focal + torch.tensor([camera.cx, camera.cy]).to(points)
+
+
+def smoothness(field, images, valid):
+    valid = valid.view(images.shape[:3])
+    total = 0
+    for dim in (2, 1):
+        step = field.diff(dim=dim).abs().sum(dim=3)
+        edges = torch.exp(-EDGE_SHARPNESS * images.diff(dim=dim).abs().mean(dim=3))
+        both = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
+        total = total + (step * edges * both).sum(dim=(1, 2))
+    return total
+
+
+def photometric(images, next_images, flow, valid):
+    height, width = images.shape[1:3]
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    last, margin = torch.tensor([width - 1, height - 1]).to(flow), 1e-3
+    where = torch.stack([u, v], dim=-1).to(flow) + flow
+    in_view = ((where >= -margin) & (where <= last + margin)).all(dim=-1)
+    warped = F.grid_sample(next_images.permute(0, 3, 1, 2), 2 * where / last - 1, padding_mode="border",
+                           align_corners=True).permute(0, 2, 3, 1)
+    return ((images - warped).abs().sum(dim=3) * (in_view & valid.view(in_view.shape))).sum(dim=(1, 2))
+
+
+def loss_terms(p, sizes, b, camera, nearest):
+    """Batch means of all terms of Eq. (6); training.loss_terms."""
+    features, state = encode(p, b["points"], b["valid"])
+    next_features, next_state = encode(p, b["next_points"], b["next_valid"])
+    predicted, _, embedding = forward_model(p, sizes, b["points"], b["valid"], b["pokes"], features, state)
+    start, end = inverse_model(p, b["points"], b["next_points"], b["valid"] & b["next_valid"], features, next_features,
+                               b["cells"])
+    images, next_images = b["images"], b["next_images"]
+    flow = (project(predicted, camera) - project(b["points"], camera)).view(*images.shape[:3], 2)
+    here = distance_map(predicted, b["next_points"], b["next_shared"], b["shared"], nearest)
+    there = distance_map(b["next_points"], predicted, b["shared"], b["next_shared"], nearest)
+    grid = images.shape[:3] + (1,)
+    terms = {
+        "chamfer": (here + there).sum(dim=1),
+        "distance_smoothness": smoothness(there.view(grid), next_images, b["next_shared"])
+        + smoothness(here.view(grid), images, b["shared"]),
+        "photometric": photometric(images, next_images, flow, b["shared"]),
+        "flow_smoothness": smoothness(flow, images, b["valid"]),
+        "inverse": F.cross_entropy(start, b["start_cells"], reduction="none")
+        + F.cross_entropy(end, b["end_cells"], reduction="none") + (embedding - next_state).abs().mean(dim=1),
+    }
+    return {name: value.mean() for name, value in terms.items()}
+
+
+def full_loss(p, sizes, b, camera, weights, nearest):
+    """Eq. (6) -> scalar."""
+    terms = loss_terms(p, sizes, b, camera, nearest)
+    return sum(weights[name] * terms[name] for name in terms)

@@ -1,0 +1,146 @@
+"""A training step of the full model: ours against PyTorch's, and what no implementation can avoid.
+
+    python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
+
+Every contender is a process of its own, which makes the same steps on the same pokes: batch, forward, losses,
+backward, Adam. They take turns, so that a machine whose speed drifts slows all of them, and every ratio is taken within a round.
+BLAS has one thread in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and
+compiled, and the fastest median counts. Memory is the peak resident size, worker processes added up.
+"""
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+DATA = Path(__file__).resolve().parent.parent / "data_small" / "train"
+OURS = ("ours_1_process", "ours_2_processes")
+TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree", "brute")
+              for mode in ("eager", "compiled") for threads in (1, 2))
+
+
+# --- the contenders: a function that makes n steps --------------------------------------------------------------
+
+def ours(batch, jobs):
+    """training.train itself, a few steps at a time, its worker processes kept."""
+    from hind4sight_min import training
+    from hind4sight_min.interactions import load_interactions
+    data = load_interactions(DATA)
+    run = training.start_run(training.Recipe(steps=10 ** 6, batch=batch), data)
+    stop = training.workers(jobs)
+    gradients = stop.__enter__()
+
+    def steps(count):
+        for _ in range(count):
+            training.training_step(data, run, gradients)
+    return steps, lambda: stop.__exit__(None, None, None)
+
+
+def twin(batch, chamfer, mode, threads):
+    import torch
+    import torch_twin
+
+    from hind4sight_min import training
+    from hind4sight_min.interactions import load_interactions
+    torch.set_num_threads(threads)
+    data = load_interactions(DATA)
+    recipe = training.Recipe(steps=10 ** 6, batch=batch)
+    run = training.start_run(recipe, data)
+    params = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in run.params.items()}
+    optimiser = torch.optim.Adam(params.values(), lr=recipe.learning_rate)
+    nearest = {"tree": torch_twin.nearest_by_tree, "brute": torch_twin.nearest_by_brute_force}[chamfer]
+    if mode == "compiled":
+        nearest = torch.compiler.disable(nearest)
+    loss = torch.compile(torch_twin.full_loss) if mode == "compiled" else torch_twin.full_loss
+
+    def steps(count):
+        for _ in range(count):
+            rows, mirror, _ = training.rows_of_step(recipe, len(data), run.step)
+            tensors = torch_twin.tensors(training.make_batch(data, rows, mirror))
+            optimiser.zero_grad()
+            loss(params, recipe.sizes, tensors, data.camera, training.WEIGHTS, nearest).backward()
+            optimiser.step()
+            run.step += 1
+    return steps, lambda: None
+
+
+def work(name, batch):
+    """The process of one contender: a number of steps per line of input, the seconds they took per line of output."""
+    import hind4sight_min  # noqa: F401: sets the BLAS threads before NumPy loads
+    if name in OURS:
+        jobs = 1 + OURS.index(name)
+        steps, stop = ours(batch, jobs)
+    else:
+        _, chamfer, mode, threads, _ = name.split("_")
+        jobs, (steps, stop) = 1, twin(batch, chamfer, mode, int(threads))
+    for line in sys.stdin:
+        start = time.perf_counter()
+        steps(int(line))
+        print(time.perf_counter() - start, flush=True)
+    stop()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if jobs > 1:
+        peak += jobs * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    print(peak / 1024, flush=True)
+
+
+# --- the comparison -----------------------------------------------------------------------------------------------
+
+class Contender:
+    def __init__(self, name, batch):
+        self.name = name
+        self.process = subprocess.Popen([sys.executable, __file__, "--contender", name, "--batch", str(batch)],
+                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def seconds_per_step(self, count):
+        self.process.stdin.write(f"{count}\n")
+        self.process.stdin.flush()
+        return float(self.process.stdout.readline()) / count
+
+    def stop(self):
+        """Ends the process -> its peak memory in MB."""
+        self.process.stdin.close()
+        return float(self.process.stdout.readlines()[-1])
+
+
+def compare(names, batch, rounds, count):
+    """-> {name: seconds per step of every round}, {name: peak MB}."""
+    contenders = {}
+    for name in names:
+        try:
+            contenders[name] = Contender(name, batch)
+            contenders[name].seconds_per_step(2)  # warm up; compile
+        except ValueError:
+            print(f"{name}: does not run here")
+            del contenders[name]
+    seconds = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, contender in contenders.items():
+            seconds[name].append(contender.seconds_per_step(count))
+    return seconds, {name: contender.stop() for name, contender in contenders.items()}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--steps", type=int, default=8, help="of each contender per round")
+    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--only", nargs="+", choices=OURS + TWINS, default=OURS + TWINS)
+    parser.add_argument("--contender", choices=OURS + TWINS, help=argparse.SUPPRESS)
+    parser.add_argument("--json")
+    args = parser.parse_args()
+    if args.contender:
+        return work(args.contender, args.batch)
+    seconds, memory = compare(args.only, args.batch, args.rounds, args.steps)
+    for name, values in seconds.items():
+        print(f"{name:<32} {1e3 * statistics.median(values):7.0f} ms a step ({1e3 * min(values):.0f} to "
+              f"{1e3 * max(values):.0f}), {memory[name]:.0f} MB")
+    print(json.dumps({}) if args.json else "")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""The PyTorch twin of the benchmarks computes what we compute: all terms and the gradient of Eq. (6)."""
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hind4sight_min import training
+from hind4sight_min.interactions import load_interactions
+
+torch = pytest.importorskip("torch", reason="PyTorch is only installed with the extra 'bench'")
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import torch_twin as twin  # noqa: E402
+
+
+@pytest.mark.parametrize("nearest", ["nearest_by_tree", "nearest_by_brute_force"])
+def test_terms_and_gradient_of_the_twin_are_ours(nearest):
+    data = load_interactions(ROOT / "data_small" / "train")
+    run = training.start_run(training.Recipe(), data)
+    run.vector = run.vector + 0.02 * np.random.default_rng(0).standard_normal(run.vector.shape).astype(np.float32)
+    batch = training.make_batch(data, np.arange(6), mirror=[False, True] * 3)
+    terms, gradient = training.batch_gradient(run.vector, run.layout, run.recipe.sizes, batch, data.camera,
+                                              training.WEIGHTS)
+    vector = torch.from_numpy(run.vector).requires_grad_()
+    parts = vector.split([int(np.prod(shape)) for shape in run.layout.values()])
+    params = {name: part.view(shape) for (name, shape), part in zip(run.layout.items(), parts)}
+    found = twin.loss_terms(params, run.recipe.sizes, twin.tensors(batch), data.camera, getattr(twin, nearest))
+    for name, value in terms.items():
+        assert value > 0
+        np.testing.assert_allclose(found[name].item(), value, rtol=1e-4, err_msg=name)
+    sum(training.WEIGHTS[name] * found[name] for name in found).backward()
+    difference = vector.grad.numpy() - gradient
+    assert np.linalg.norm(difference) < 1e-3 * np.linalg.norm(gradient)
