@@ -40,8 +40,8 @@ def poke_features(local):
 
 
 def height_map(local, valid):
-    across, along = ((1 - (local[..., axis, None] - torch.from_numpy(centres).to(local)).abs() / networks.MAP_CELL)
-                     .clamp(min=0) for axis, centres in ((1, networks.MAP_Y), (0, networks.MAP_X)))
+    across, along = ((1 - (local[..., axis, None] / networks.MAP_CELL - torch.from_numpy(centres)).abs()).clamp(min=0)
+                     for axis, centres in ((1, networks.MAP_Y), (0, networks.MAP_X)))
     across, along = across * valid[..., None], along.transpose(1, 2)
     return (along @ (across * local[..., 2:].clamp(min=0)) / (along @ across + 0.2) / 0.03).flatten(1)
 

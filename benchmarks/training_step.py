@@ -3,19 +3,19 @@
     python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
 
 Every contender is a process of its own, which makes the same steps on the same pokes: batch, forward, losses,
-backward, Adam. They take turns, so that a machine whose speed drifts slows all of them, and every ratio is taken within a round.
-BLAS has one thread in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and
-compiled, and the fastest median counts. Memory is the peak resident size, worker processes added up.
+backward, Adam. They take turns, so that a machine whose speed drifts slows all of them, and ratios are taken within a
+round. BLAS has one thread in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer,
+eager and compiled, and the fastest median counts. Memory is the peak resident size, worker processes added up.
 """
 import argparse
-import json
 import resource
 import statistics
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
+
+from hind4sight_min.__main__ import write_json
 
 DATA = Path(__file__).resolve().parent.parent / "data_small" / "train"
 OURS = ("ours_1_process", "ours_2_processes")
@@ -70,7 +70,6 @@ def twin(batch, chamfer, mode, threads):
 
 def work(name, batch):
     """The process of one contender: a number of steps per line of input, the seconds they took per line of output."""
-    import hind4sight_min  # noqa: F401: sets the BLAS threads before NumPy loads
     if name in OURS:
         jobs = 1 + OURS.index(name)
         steps, stop = ours(batch, jobs)
@@ -108,7 +107,7 @@ class Contender:
 
 
 def compare(names, batch, rounds, count):
-    """-> {name: seconds per step of every round}, {name: peak MB}."""
+    """Every contender in turn, round after round -> {name: seconds per step of each round}, {name: peak MB}."""
     contenders = {}
     for name in names:
         try:
@@ -139,7 +138,18 @@ def main():
     for name, values in seconds.items():
         print(f"{name:<32} {1e3 * statistics.median(values):7.0f} ms a step ({1e3 * min(values):.0f} to "
               f"{1e3 * max(values):.0f}), {memory[name]:.0f} MB")
-    print(json.dumps({}) if args.json else "")
+    figures = {f"{name}_ms": 1e3 * statistics.median(values) for name, values in seconds.items()}
+    figures.update({f"{name}_mb": value for name, value in memory.items()})
+    best_of = {kind: min((name for name in names if name in seconds), key=lambda name: statistics.median(seconds[name]))
+               for kind, names in (("ours", OURS), ("torch", TWINS)) if any(name in seconds for name in names)}
+    if len(best_of) == 2:
+        ratios = [twin / own for own, twin in zip(seconds[best_of["ours"]], seconds[best_of["torch"]])]
+        share = memory[best_of["ours"]] / memory[best_of["torch"]]
+        figures.update(train_step_speedup_vs_torch=statistics.median(ratios), train_step_memory_vs_torch=share,
+                       train_step_speedup_vs_torch_min=min(ratios), train_step_speedup_vs_torch_max=max(ratios))
+        print(f"{best_of['ours']} is {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) times as "
+              f"fast as {best_of['torch']}, with {share:.2f} of its memory")
+    write_json(args.json, figures)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Read in this order: geometry, ops, losses, networks, training, interactions, sim
 """
 import os
 
-# Our matrices are small and the batch is spread over threads instead (training.py): a BLAS that
+# Our matrices are small and the batch is spread over processes instead (training.py): a BLAS that
 # starts threads of its own then competes with them. Set before NumPy loads, unless the user did.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")

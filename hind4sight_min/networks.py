@@ -83,7 +83,8 @@ def poke_features(local):
 
 
 MAP_CELL = 0.02  # m
-MAP_X, MAP_Y = MAP_CELL * onp.arange(-6.5, 7), MAP_CELL * onp.arange(-4.5, 5)  # cell centres in the poke frame
+MAP_X = onp.arange(-6.5, 7, dtype=onp.float32)  # cell centres in the poke frame, in cells
+MAP_Y = onp.arange(-4.5, 5, dtype=onp.float32)
 
 
 def height_map(local, valid):
@@ -92,7 +93,7 @@ def height_map(local, valid):
     local (B, N, 3) m, poke frame; valid (B, N) bool. A point counts for the four cells around it, bilinearly, so
     that the map changes smoothly with the poke. A cell that no point is near reads 0.
     """
-    across, along = (onp.maximum(0, 1 - onp.abs(local[..., axis, None] - centres) / MAP_CELL)  # (B, N, cells)
+    across, along = (onp.maximum(0, 1 - onp.abs(local[..., axis, None] / MAP_CELL - centres))  # (B, N, cells)
                      for axis, centres in ((1, MAP_Y), (0, MAP_X)))
     across, along = across * valid[..., None], onp.swapaxes(along, 1, 2)
     count = onp.matmul(along, across)
