@@ -139,11 +139,18 @@ def _draw_flows(panels, flows):
     scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for *_, flow in flows))  # px
     for label, title, flow in flows:
         _show(panels[label], flow_to_rgb(flow, scale), title)
-    axes = panels[flows[0][0]]
-    wheel = axes.inset_axes((0.74, 0.68, 0.24, 0.30))
+    label, _, flow = flows[0]
+    axes, length = panels[label], np.linalg.norm(flow, axis=-1)
+    (middle_y, middle_x), quarters = np.array(length.shape) // 2, {}
+    for x, columns in ((0.74, np.s_[middle_x:]), (0.02, np.s_[:middle_x])):  # in the quarter with the least flow
+        for y, rows in ((0.68, np.s_[:middle_y]), (0.02, np.s_[middle_y:])):
+            quarters[x, y] = length[rows, columns].sum()
+    x, y = min(quarters, key=quarters.get)
+    wheel = axes.inset_axes((x, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))
     wheel.axis("off")
-    axes.text(0.72, 0.97, f"rim:\n{scale:.1f} px", fontsize=9, ha="right", va="top", transform=axes.transAxes)
+    beside, side = (x - 0.02, "right") if x > 0.5 else (x + 0.26, "left")
+    axes.text(beside, y + 0.15, f"rim:\n{scale:.1f} px", fontsize=9, ha=side, va="center", transform=axes.transAxes)
 
 
 def _draw_error(figure, axes, image, warped, flow, shared):

@@ -160,6 +160,18 @@ def test_flow_without_depth_neither_shows_nor_sets_the_scale():
     assert "2.5 px" in drawn["flow"].texts[0].get_text()
 
 
+@pytest.mark.parametrize("still", [(x, y) for x in (0, 1) for y in (0, 1)])
+def test_the_wheel_lies_where_there_is_least_flow(still):
+    flow = np.ones((H, W, 2))
+    rows, columns = (slice(H // 2), slice(H // 2, None))[still[1]], (slice(W // 2), slice(W // 2, None))[still[0]]
+    flow[rows, columns] = 0
+    axes = panels(interaction_figure(**example(optical_flow=flow)))["flow"]
+    x0, y0, x1, y1 = axes.child_axes[0].get_position().extents  # in the figure; the panel's own corners likewise
+    left, bottom, right, top = axes.get_position().extents
+    assert ((x0 + x1) / 2 > (left + right) / 2) == bool(still[0])
+    assert ((y0 + y1) / 2 < (bottom + top) / 2) == bool(still[1])
+
+
 def test_masks_are_coloured_over_grey():
     given = example(truth=True)
     drawn = panels(interaction_figure(**given))
