@@ -5,7 +5,8 @@
 Every contender is a process of its own, which makes the same steps on the same pokes: batch, forward, losses,
 backward, Adam. They take turns, so that a machine whose speed drifts slows all of them, and ratios are taken within a
 round. BLAS has one thread in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer,
-eager and compiled, and the fastest median counts. Memory is the peak resident size, worker processes added up.
+eager and compiled, and the fastest median counts; what starts off three times slower than the fastest is left out.
+Memory is the peak resident size, worker processes added up.
 """
 import argparse
 import resource
@@ -108,14 +109,20 @@ class Contender:
 
 def compare(names, batch, rounds, count):
     """Every contender in turn, round after round -> {name: seconds per step of each round}, {name: peak MB}."""
-    contenders = {}
+    contenders, first = {}, {}
     for name in names:
+        contender = Contender(name, batch)
         try:
-            contenders[name] = Contender(name, batch)
-            contenders[name].seconds_per_step(2)  # warm up; compile
+            contender.seconds_per_step(2)  # warm up; compile
+            first[name] = contender.seconds_per_step(1)
         except ValueError:
-            print(f"{name}: does not run here")
-            del contenders[name]
+            print(f"{name}: does not run here", flush=True)
+            continue
+        if first[name] > 3 * min(first.values()):
+            print(f"{name}: {first[name]:.1f} s a step, out of the race", flush=True)
+            contender.stop()
+            continue
+        contenders[name] = contender
     seconds = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, contender in contenders.items():

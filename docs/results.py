@@ -48,6 +48,10 @@ HEADLINES = {
                                 "{:.2f}", ">= 0.80"),
     "collect_jobs2_speedup": ("collection", "collect_jobs2_speedup", "collection: two processes against one",
                               "{:.2f}", ">= 1.7"),
+    "train_step_speedup_vs_torch": ("training_step", "train_step_speedup_vs_torch",
+                                    "training step: speed against PyTorch's best", "{:.2f}", ">= 1.5"),
+    "train_step_memory_vs_torch": ("training_step", "train_step_memory_vs_torch",
+                                   "training step: peak memory against PyTorch's best", "{:.2f}", "<= 0.5"),
 }
 
 

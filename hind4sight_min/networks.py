@@ -1,7 +1,8 @@
 """The siamese point encoder, the forward model and the inverse model. Parameters are a dict of arrays.
 
-Every network is the same small perceptron applied to each point, plus *context*: pooled features of the
-whole cloud, handed back to every point. Paper: Sec. III-A, III-E and Fig. 3.
+Every network is the same small perceptron applied to each point, plus *context*: pooled features of the whole cloud and
+a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
+once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
 """
 from dataclasses import dataclass
 
