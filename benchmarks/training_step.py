@@ -1,4 +1,4 @@
-"""A training step of the full model: ours against PyTorch's, and what no implementation can avoid.
+"""A training step of the full model: ours against PyTorch's.
 
     python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
 
@@ -14,39 +14,33 @@ import statistics
 import subprocess
 import sys
 import time
-from pathlib import Path
+from contextlib import contextmanager
 
-from hind4sight_min.__main__ import write_json
+from hind4sight_min import training
+from hind4sight_min.__main__ import data_small, write_json
+from hind4sight_min.interactions import load_interactions
 
-DATA = Path(__file__).resolve().parent.parent / "data_small" / "train"
+DATA = data_small() / "train"
 OURS = ("ours_1_process", "ours_2_processes")
 TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree", "brute")
               for mode in ("eager", "compiled") for threads in (1, 2))
 
 
-# --- the contenders: a function that makes n steps --------------------------------------------------------------
+# --- the contenders: a block with a function that makes one step ------------------------------------------------
 
+@contextmanager
 def ours(batch, jobs):
-    """training.train itself, a few steps at a time, its worker processes kept."""
-    from hind4sight_min import training
-    from hind4sight_min.interactions import load_interactions
+    """The steps of training.train, one at a time, its worker processes kept."""
     data = load_interactions(DATA)
     run = training.start_run(training.Recipe(steps=10 ** 6, batch=batch), data)
-    stop = training.workers(jobs)
-    gradients = stop.__enter__()
-
-    def steps(count):
-        for _ in range(count):
-            training.training_step(data, run, gradients)
-    return steps, lambda: stop.__exit__(None, None, None)
+    with training.workers(jobs) as gradients:
+        yield lambda: training.training_step(data, run, gradients)
 
 
+@contextmanager
 def twin(batch, chamfer, mode, threads):
     import torch
     import torch_twin
-
-    from hind4sight_min import training
-    from hind4sight_min.interactions import load_interactions
     torch.set_num_threads(threads)
     data = load_interactions(DATA)
     recipe = training.Recipe(steps=10 ** 6, batch=batch)
@@ -58,30 +52,30 @@ def twin(batch, chamfer, mode, threads):
         nearest = torch.compiler.disable(nearest)
     loss = torch.compile(torch_twin.full_loss) if mode == "compiled" else torch_twin.full_loss
 
-    def steps(count):
-        for _ in range(count):
-            rows, mirror, _ = training.rows_of_step(recipe, len(data), run.step)
-            tensors = torch_twin.tensors(training.make_batch(data, rows, mirror))
-            optimiser.zero_grad()
-            loss(params, recipe.sizes, tensors, data.camera, training.WEIGHTS, nearest).backward()
-            optimiser.step()
-            run.step += 1
-    return steps, lambda: None
+    def step():
+        rows, mirror, _ = training.rows_of_step(recipe, len(data), run.step)
+        tensors = torch_twin.tensors(training.make_batch(data, rows, mirror))
+        optimiser.zero_grad()
+        loss(params, recipe.sizes, tensors, data.camera, training.WEIGHTS, nearest).backward()
+        optimiser.step()
+        run.step += 1
+    yield step
 
 
 def work(name, batch):
     """The process of one contender: a number of steps per line of input, the seconds they took per line of output."""
     if name in OURS:
         jobs = 1 + OURS.index(name)
-        steps, stop = ours(batch, jobs)
+        contender = ours(batch, jobs)
     else:
         _, chamfer, mode, threads, _ = name.split("_")
-        jobs, (steps, stop) = 1, twin(batch, chamfer, mode, int(threads))
-    for line in sys.stdin:
-        start = time.perf_counter()
-        steps(int(line))
-        print(time.perf_counter() - start, flush=True)
-    stop()
+        jobs, contender = 1, twin(batch, chamfer, mode, int(threads))
+    with contender as step:
+        for line in sys.stdin:
+            start = time.perf_counter()
+            for _ in range(int(line)):
+                step()
+            print(time.perf_counter() - start, flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     if jobs > 1:
         peak += jobs * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
@@ -92,7 +86,6 @@ def work(name, batch):
 
 class Contender:
     def __init__(self, name, batch):
-        self.name = name
         self.process = subprocess.Popen([sys.executable, __file__, "--contender", name, "--batch", str(batch)],
                                         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
