@@ -3,10 +3,23 @@
 Read in this order: geometry, ops, losses, networks, training, interactions, simulator, evaluation.
 """
 import os
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 # Our matrices are small and the batch is spread over processes instead (training.py): a BLAS that
 # starts threads of its own then competes with them. Set before NumPy loads, unless the user did.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+
+def worker_pool(jobs):
+    """A pool of `jobs` processes, for collection and for training; an interrupt is left to the parent to handle.
+
+    Fresh processes, not forks, which neither Bullet nor thread pools survive; so a script that asks for jobs > 1
+    needs the usual `if __name__ == "__main__":`.
+    """
+    return ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN))
+
 
 __version__ = "0.1.0"

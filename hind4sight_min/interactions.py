@@ -88,7 +88,10 @@ def points_and_validity(depth, camera):
     return unproject(depth, camera), depth > 0
 
 
-def occupied_pixels(depth, empty_depth, threshold=0.008):
+OCCUPIED = 0.008  # m: background subtraction takes what is nearer than the empty arena by more for an object
+
+
+def occupied_pixels(depth, empty_depth, threshold=OCCUPIED):
     """Background subtraction: (..., H, W) bool, where something stands in the arena. Paper: Sec. IV-A.
 
     depth, empty_depth (..., H, W) m. A pixel counts when it is nearer than the empty arena by more than `threshold` m.

@@ -56,8 +56,8 @@ def position_features(points, unit, wavelengths):
 
     tanh(z / 1 cm) tells the table from what stands on it, by a threshold no perceptron would learn to be as sharp.
     """
-    return onp.concatenate([points / unit, onp.tanh(points[..., 2:] / 0.01),
-                            fourier(points[..., :2], wavelengths)], axis=-1).astype(points.dtype)
+    return onp.concatenate([points / unit, onp.tanh(points[..., 2:] / 0.01), fourier(points[..., :2], wavelengths)],
+                           axis=-1)
 
 
 def encoder_features(points):
@@ -99,7 +99,7 @@ def height_map(local, valid):
     across, along = across * valid[..., None], onp.swapaxes(along, 1, 2)
     count = onp.matmul(along, across)
     total = onp.matmul(along, across * onp.maximum(local[..., 2:], 0))
-    return (total / (count + 0.2) / 0.03).reshape(len(local), -1).astype(local.dtype)
+    return (total / (count + 0.2) / 0.03).reshape(len(local), -1)
 
 
 def pooling_weights(local, valid):

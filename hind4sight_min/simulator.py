@@ -3,20 +3,19 @@
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
 import json
-import signal
 import tempfile
 import time
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from . import worker_pool
 from .geometry import Camera, look_at, unproject
-from .interactions import (Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
+from .interactions import (OCCUPIED, Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
                            occupied_pixels, save_shard, truth_path)
 from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
 
@@ -332,7 +331,7 @@ class Arena:
         return self._settle()
 
 
-def occupied_cells(depth, empty_depth, camera, settings, threshold=0.008):
+def occupied_cells(depth, empty_depth, camera, settings, threshold=OCCUPIED):
     """Which cells of the arena's grid hold something: those of occupied pixels inside the walls. Paper: Sec. IV-A.
 
     depth, empty_depth (H, W) m; threshold: of `occupied_pixels`, m -> (rows, columns) bool.
@@ -443,9 +442,8 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
     if jobs == 1 or len(todo) <= 1:
         for job in todo:
             account(job, _collect_job(*job))
-    else:  # fresh processes: Bullet and thread pools do not survive a fork
-        ignore = (signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the parent to handle
-        with ProcessPoolExecutor(min(jobs, len(todo)), get_context("spawn"), signal.signal, ignore) as pool:
+    else:
+        with worker_pool(min(jobs, len(todo))) as pool:
             futures = {pool.submit(_collect_job, *job): job for job in todo}
             try:
                 for future in as_completed(futures):

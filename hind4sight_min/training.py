@@ -3,18 +3,15 @@
 Nothing here reads the simulator's truth.
 """
 import math
-import signal
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
 
 import autograd.numpy as np
 import numpy as onp
 from autograd import grad
 from autograd.tracer import getval
 
-from . import losses
+from . import losses, worker_pool
 from .interactions import (add_depth_noise, cell_centres, cells_of, load_npz, occupied_pixels, points_and_validity,
                            save_npz)
 from .networks import Sizes, encode, forward_model, init_parameters, inverse_model, predicted_flow
@@ -244,14 +241,11 @@ def workers(jobs):
     """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes.
 
     Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
-    Fresh processes, not forks, which do not survive thread pools; so a script that trains with jobs > 1 needs
-    the usual `if __name__ == "__main__":`.
     """
     if jobs == 1:
         yield lambda arguments: [chunk_gradient(*each) for each in arguments]
         return
-    ignore = (signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the parent to handle
-    with ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, ignore) as pool:
+    with worker_pool(jobs) as pool:
         yield lambda arguments: [job.result() for job in [pool.submit(chunk_gradient, *each) for each in arguments]]
 
 
@@ -288,11 +282,11 @@ def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
     recipe, per_epoch = run.recipe, max(1, len(interactions) // run.recipe.batch)
     with workers(min(jobs, -(-recipe.batch // CHUNK))) as gradients:
         while run.step < recipe.steps:
-            rate = learning_rate(recipe, run.step)
             training_step(interactions, run, gradients)
             if run.step % per_epoch == 0 or run.step == recipe.steps:
                 first = run.log[-1]["step"] if run.log else 0
-                run.log.append({"epoch": len(run.log) + 1, "step": run.step, "learning_rate": rate,
+                run.log.append({"epoch": len(run.log) + 1, "step": run.step,
+                                "learning_rate": learning_rate(recipe, run.step - 1),
                                 **{name: value / (run.step - first) for name, value in run.sums.items()}})
                 run.sums = {}
                 if on_epoch:
