@@ -6,9 +6,9 @@
 
 `record NAME -- COMMAND` runs COMMAND with `--json` added and writes docs/results/NAME.json: the figures, the
 command, commit, versions, machine and duration. `ship CHECKPOINT` makes the checkpoint of the recorded result
-`training` the shipped one: without the optimiser's state, with its command and commit inside. `summary` gathers the headline figures of all recorded results
-in docs/results/summary.json and writes the README's table from them; a test fails while the README says
-anything else.
+`training` the shipped one: without the optimiser's state, with its command and commit inside. `summary` gathers the
+headline figures of all recorded results in docs/results/summary.json and writes the README's table from them; a test
+fails while the README says anything else.
 """
 import json
 import os
