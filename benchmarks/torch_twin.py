@@ -64,10 +64,13 @@ def linear(p, name, x):
     return x @ p[name + "_w"] + p[name + "_b"]
 
 
-def encode(p, points, valid):
+def encode(p, points):
     x = torch.relu(linear(p, "encoder_1", encoder_features(points)))
-    x = torch.relu(linear(p, "encoder_2", x))
-    return x, (x * valid[..., None]).sum(dim=1) / valid.sum(dim=1, keepdim=True).clamp(min=1)
+    return torch.relu(linear(p, "encoder_2", x))
+
+
+def state_embedding(features, valid):
+    return (features * valid[..., None]).sum(dim=1) / valid.sum(dim=1, keepdim=True).clamp(min=1)
 
 
 def so3_exp(w):
@@ -82,8 +85,10 @@ def so3_exp(w):
     return torch.eye(3, dtype=w.dtype) + a[..., None, None] * cross + b[..., None, None] * (cross @ cross)
 
 
-def forward_model(p, sizes, points, valid, pokes, features, state):
+def forward_model(p, sizes, points, valid, pokes):
     """-> predicted points, masks, next embedding; networks.forward_model."""
+    features = encode(p, points)
+    state = state_embedding(features, valid)
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
     pooling = pooling_weights(local, valid)
@@ -119,18 +124,13 @@ def forward_model(p, sizes, points, valid, pokes, features, state):
     return predicted, masks, state + linear(p, "next_2", change) / networks.CHANGE_GAIN
 
 
-def inverse_model(p, points, next_points, valid, features, next_features, cells):
-    change = ((next_points - points) ** 2).sum(dim=2) ** 2 * valid
-    weights, rows = change.topk(min(networks.CHANGED_POINTS, change.shape[1]), dim=1)
-    weights = weights / (weights.sum(dim=1, keepdim=True) + torch.finfo(points.dtype).tiny)
-    pick = (torch.arange(len(points))[:, None], rows)
-    before, after = points[pick], next_points[pick]
+def inverse_model(p, before, after, weights, cells):
     centre = (weights[..., None] * (before + after)).sum(dim=1) / 2
     centre = torch.cat([centre[:, :2], torch.zeros_like(centre[:, 2:])], dim=1)
     x = torch.cat([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
-                   features[pick], next_features[pick]], dim=2)
+                   encode(p, before), encode(p, after)], dim=2)
     context = (weights[:, None] @ torch.relu(linear(p, "change", x)))[:, 0]
-    local = (cells - centre[:, None, :2]).to(points.dtype)
+    local = (cells - centre[:, None, :2]).to(before.dtype)
     y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
     y = torch.relu(linear(p, "cell_1", y))
     y = torch.relu(y @ p["cell_2_w"] + linear(p, "cell_context", context)[:, None])
@@ -192,11 +192,9 @@ def photometric(images, next_images, flow, valid):
 
 def loss_terms(p, sizes, b, camera, nearest):
     """Batch means of all terms of Eq. (6); training.loss_terms."""
-    features, state = encode(p, b["points"], b["valid"])
-    next_features, next_state = encode(p, b["next_points"], b["next_valid"])
-    predicted, _, embedding = forward_model(p, sizes, b["points"], b["valid"], b["pokes"], features, state)
-    start, end = inverse_model(p, b["points"], b["next_points"], b["valid"] & b["next_valid"], features, next_features,
-                               b["cells"])
+    predicted, _, embedding = forward_model(p, sizes, b["points"], b["valid"], b["pokes"])
+    next_embedding = state_embedding(encode(p, b["next_points"]), b["next_valid"])
+    start, end = inverse_model(p, b["before"], b["after"], b["change"], b["cells"])
     images, next_images = b["images"], b["next_images"]
     flow = (project(predicted, camera) - project(b["points"], camera)).view(*images.shape[:3], 2)
     here = distance_map(predicted, b["next_points"], b["next_shared"], b["shared"], nearest)
@@ -209,7 +207,7 @@ def loss_terms(p, sizes, b, camera, nearest):
         "photometric": photometric(images, next_images, flow, b["shared"]),
         "flow_smoothness": smoothness(flow, images, b["valid"]),
         "inverse": F.cross_entropy(start, b["start_cells"], reduction="none")
-        + F.cross_entropy(end, b["end_cells"], reduction="none") + (embedding - next_state).abs().mean(dim=1),
+        + F.cross_entropy(end, b["end_cells"], reduction="none") + (embedding - next_embedding).abs().mean(dim=1),
     }
     return {name: value.mean() for name, value in terms.items()}
 

@@ -2,10 +2,13 @@
 
 This file reads the simulator's truth; training does not.
 """
+from dataclasses import replace
+
 import numpy as np
 
 from .geometry import optical_flow
 from .interactions import cell_centres, true_scene_flow
+from .networks import windows
 from .ops import softmax
 from .training import make_batch, run_model
 
@@ -13,10 +16,24 @@ MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objec
 
 
 def predict(run, interactions, rows):
-    """The whole model on some rows -> (Batch, Prediction, optical flow, start heat-maps, end heat-maps)."""
-    batch = make_batch(interactions, rows)
-    prediction, flow, heatmaps, _ = run_model(run.params, run.recipe.sizes, batch, interactions.camera)
-    return (batch, prediction, flow, *map(softmax, heatmaps))
+    """The whole model on some rows, its windows pasted into the whole picture.
+
+    -> (whole Batch, Prediction, optical flow (B, H, W, 2) px, start heat-maps, end heat-maps). Outside the windows all
+    is background and stays.
+    """
+    camera = interactions.camera
+    batch, whole = make_batch(interactions, rows), make_batch(interactions, rows, whole=True)
+    prediction, flow, heatmaps = run_model(run.params, run.recipe.sizes, batch, camera)
+    picture = (len(rows), camera.height, camera.width)
+    background = np.eye(run.recipe.sizes.masks, dtype=np.float32)[0]
+    points, masks, pixels = (np.empty(picture + (size,), np.float32) for size in (3, len(background), 2))
+    points[:], masks[:], pixels[:] = whole.points.reshape(points.shape), background, 0
+    for i, part in enumerate(windows(whole.pokes, camera)):
+        for target, values in ((points, prediction.points), (masks, prediction.masks), (pixels, flow)):
+            target[(i, *part)] = values[i].reshape(flow.shape[1:3] + (-1,))
+    prediction = replace(prediction, points=points.reshape(whole.points.shape),
+                         masks=masks.reshape(whole.points.shape[:2] + (-1,)))
+    return (whole, prediction, pixels, *map(softmax, heatmaps))
 
 
 def poke_from_heatmaps(start_heatmaps, end_heatmaps, settings):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import autograd.numpy as np
 import numpy as onp
+from autograd.extend import defvjp, defvjp_argnums, primitive
 
 from .ops import take
 
@@ -76,7 +77,7 @@ def look_at(eye, target):
 def rigid(points, transform):
     """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points."""
     matrix = transform.astype(points.dtype)
-    return np.dot(points, matrix[:3, :3].T) + matrix[:3, 3]
+    return np.matmul(points, matrix[:3, :3].T) + matrix[:3, 3]  # ten times as fast as np.dot on a stack of clouds
 
 
 def unproject(depth, camera):
@@ -125,30 +126,51 @@ def optical_flow(points, predicted, camera):
     return project(predicted, camera) - project(points, camera)
 
 
+@primitive
 def so3_exp(rotation_vector):
     """Rotation vectors (..., 3) rad -> rotation matrices (..., 3, 3): Rodrigues' formula.
 
-    R = I + a [w]x + b [w]x^2,  a = sin(t)/t,  b = 2 sin^2(t/2)/t^2,  t = |w|.
-    b in this form keeps its digits in float32, where (1 - cos t)/t^2 is 0 from t = 1e-4 down. Below
-    t = 1e-2 both are Taylor series, evaluated on a *safe* t, so that no NaN gradient leaks through
-    `where`. Paper: Sec. III-A, [R, T] in SE(3).
+    R = I + a [w]x + b [w]x^2,  a = sin(t)/t,  b = (1 - cos t)/t^2,  t = |w|. Paper: Sec. III-A, [R, T] in SE(3).
     """
-    w = rotation_vector
-    square = np.sum(w * w, axis=-1)
+    a, b, _ = _so3_coefficients(rotation_vector)
+    w = _cross_matrix(rotation_vector)
+    return onp.eye(3, dtype=w.dtype) + a[..., None, None] * w + b[..., None, None] * onp.matmul(w, w)
+
+
+def _so3_coefficients(w):
+    """a = sin(t)/t, b = (1 - cos t)/t^2, c = (t - sin t)/t^3 at t = |w|: below t = 1e-2 their Taylor series."""
+    square = onp.sum(w * w, axis=-1)
     small = square < 1e-4
-    safe = np.where(small, np.ones_like(square), square)
-    t = np.sqrt(safe)
-    half = np.sin(t / 2)  # products, not `**`: autograd's derivative of a power is float64
-    a = np.where(small, 1 - square / 6 + square * square / 120, np.sin(t) / t)
-    b = np.where(small, 0.5 - square / 24 + square * square / 720, 2 * half * half / safe)
-    x, y, z = w[..., 0], w[..., 1], w[..., 2]
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    cross = np.reshape(cross, w.shape[:-1] + (3, 3))
-    return (onp.eye(3, dtype=w.dtype) + a[..., None, None] * cross
-            + b[..., None, None] * np.matmul(cross, cross))
+    t = onp.sqrt(onp.where(small, 1, square))  # a safe t, so that nothing is divided by zero
+    return (onp.where(small, 1 - square / 6 + square ** 2 / 120, onp.sin(t) / t),
+            # as a half angle it keeps its digits in float32, where (1 - cos t)/t^2 is 0 from t = 1e-4 down
+            onp.where(small, 0.5 - square / 24 + square ** 2 / 720, 2 * (onp.sin(t / 2) / t) ** 2),
+            onp.where(small, 1 / 6 - square / 120 + square ** 2 / 5040, (t - onp.sin(t)) / t ** 3))
 
 
+def _cross_matrix(w):
+    """[w]x, so that [w]x v = w x v.  (..., 3) -> (..., 3, 3)."""
+    x, y, z, zero = w[..., 0], w[..., 1], w[..., 2], onp.zeros_like(w[..., 0])
+    return onp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(w.shape + (3,))
+
+
+def _so3_exp_vjp(ans, w):
+    """dR = [J dw]x R with the left Jacobian J = I + b [w]x + c [w]x^2."""
+    _, b, c = (value[..., None] for value in _so3_coefficients(w))
+
+    def vjp(g):
+        m = onp.matmul(ans, onp.swapaxes(g, -1, -2))  # sum(g * [v]x R) = v . axial
+        axial = onp.stack([m[..., 1, 2] - m[..., 2, 1], m[..., 2, 0] - m[..., 0, 2], m[..., 0, 1] - m[..., 1, 0]],
+                          axis=-1)
+        once = onp.cross(w, axial)
+        return axial - b * once + c * onp.cross(w, once)  # J^T axial
+    return vjp
+
+
+defvjp(so3_exp, _so3_exp_vjp)
+
+
+@primitive
 def transform_layer(points, masks, rotations, translations):
     """The transform layer: every point moved by the mask-weighted mean of K rigid motions.
 
@@ -165,7 +187,65 @@ def transform_layer(points, masks, rotations, translations):
         raise ValueError("transform_layer: expected points (B, N, 3), masks (B, N, K), rotations (B, K, 3, 3), "
                          f"translations (B, K, 3), got {points.shape}, {masks.shape}, {rotations.shape}, "
                          f"{translations.shape}")
-    motions = np.concatenate([np.reshape(rotations, (batch, count, 9)), translations], axis=2)
-    blended = np.matmul(masks, motions)  # (B, N, 12)
-    matrices = np.reshape(take(blended, (..., slice(0, 9))), points.shape + (3,))
-    return np.sum(matrices * points[..., None, :], axis=-1) + take(blended, (..., slice(9, 12)))  # Eq. (1)
+    blended = onp.matmul(masks, _motions_as_rows(rotations, translations))  # (B, N, 12)
+    matrices = blended[..., :9].reshape(points.shape + (3,))
+    return onp.einsum("bnij,bnj->bni", matrices, points) + blended[..., 9:]  # Eq. (1)
+
+
+def _motions_as_rows(rotations, translations):
+    return onp.concatenate([rotations.reshape(translations.shape[:2] + (9,)), translations], axis=2)  # (B, K, 12)
+
+
+def _transform_layer_vjp(argnums, ans, args, kwargs):
+    points, masks, rotations, translations = args
+    motions = _motions_as_rows(rotations, translations)
+
+    def vjp(g):
+        # A point's pull on its blended motion: on the matrix g P^T, on the translation g.
+        pull = onp.concatenate([(g[..., None] * points[..., None, :]).reshape(g.shape[:2] + (9,)), g], axis=2)
+        on_motions = onp.matmul(onp.swapaxes(masks, 1, 2), pull)  # (B, K, 12)
+        matrices = onp.matmul(masks, motions[..., :9]).reshape(points.shape + (3,)) if 0 in argnums else None
+        gradients = (lambda: onp.einsum("bnij,bni->bnj", matrices, g),
+                     lambda: onp.matmul(pull, onp.swapaxes(motions, 1, 2)),
+                     lambda: on_motions[..., :9].reshape(rotations.shape),
+                     lambda: on_motions[..., 9:])
+        return [gradients[argnum]() for argnum in argnums]
+    return vjp
+
+
+defvjp_argnums(transform_layer, _transform_layer_vjp)
+
+
+# --- which points of a cloud cannot be near each other (speed: see ops.nearest_squared_distances) ------------------
+
+def ray_spacing(points, camera):
+    """How far each point of a depth picture is from every other one, at least: each lies on a pixel's ray of its own.
+
+    |p - eye| times the sine of the smallest angle between two rays. For directions (x, y, 1) and (x + h, y + k, 1) the
+    sine is at least |(h, k)| / (|(x, y, 1)| |(x + h, y + k, 1)|).  points (..., 3) m, arena -> (...) m.
+    """
+    corner = [max(centre, size - 1 - centre) / focal for centre, size, focal in
+              ((camera.cx, camera.width, camera.fx), (camera.cy, camera.height, camera.fy))]
+    sine = 1 / max(camera.fx, camera.fy) / (1 + corner[0] ** 2 + corner[1] ** 2)
+    offsets = points - camera.arena_from_camera[:3, 3].astype(points.dtype)
+    return onp.sqrt(onp.einsum("...d,...d->...", offsets, offsets)) * points.dtype.type(sine)
+
+
+STILL = 5e-4  # m; what moved less stayed, for `free_radius`
+
+
+def free_radius(points, predicted, spacing):
+    """A radius around each predicted point in which no other predicted point lies.
+
+    Two points that stayed are as far apart as before, less twice what they may have moved; one that stayed is as far
+    from those that moved as from the box around them. Of a point that moved we know nothing: 0.
+    points, predicted (B, N, 3) m; spacing (B, N) m, `ray_spacing` of `points` -> (B, N) m.
+    """
+    motion = predicted - points
+    moved = onp.einsum("bnd,bnd->bn", motion, motion) > STILL ** 2
+    radius = onp.where(moved, 0, onp.maximum(spacing - 2 * STILL, 0))
+    for i in onp.flatnonzero(moved.any(axis=1)):
+        movers = predicted[i, moved[i]]
+        outside = onp.maximum(onp.maximum(movers.min(axis=0) - predicted[i], predicted[i] - movers.max(axis=0)), 0)
+        radius[i] = onp.minimum(radius[i], onp.sqrt(onp.einsum("nd,nd->n", outside, outside)))
+    return radius

@@ -9,7 +9,7 @@ import autograd.numpy as np
 import numpy as onp
 from autograd.tracer import getval
 
-from .ops import bilinear_sample, nearest_squared_distances, take
+from .ops import bilinear_sample, nearest_squared_distances, take, total_variation
 
 # The paper's exp(-|grad I|) depends on the range of I. Ours is [0, 1], where exp(-40 |grad I|) makes the edge of a true
 # flow 20 times cheaper than that of one that spills onto the table; see docs/research-log.md.
@@ -30,15 +30,16 @@ def seen_in_both(valid, next_valid, occupied, next_occupied):
 
 # --- 3D -----------------------------------------------------------------------------------------------
 
-def distance_maps(predicted, observed, valid_predicted, valid_observed):
+def distance_maps(predicted, observed, valid_predicted, valid_observed, free_predicted=None, free_observed=None):
     """The two distance transforms between clouds, each on its own cloud's grid.
 
     Paper: Sec. III-B.  D_{P'->P}(i) = min_j |P'_i - P_j|^2,  D_{P->P'}(j) = min_i |P'_i - P_j|^2.
     predicted, observed (B, N, 3) m; valid_* (B, N) bool -> two maps (B, N) m^2, 0 where not valid.
     The first lives on frame t's grid, the second on frame t+1's.
+    free_* (B, N) m, from geometry.free_radius and ray_spacing: they change nothing but the time it takes.
     """
-    return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
-            nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
+    return (nearest_squared_distances(predicted, observed, valid_observed, free_observed) * valid_predicted,
+            nearest_squared_distances(observed, predicted, valid_predicted, free_predicted) * valid_observed)
 
 
 def chamfer_loss(map_predicted, map_observed):
@@ -79,8 +80,8 @@ def edge_weights(images):
 
     images (B, H, W, C) in [0, 1] -> (B, H, W-1), (B, H-1, W); |grad I| is the mean over the channels.
     """
-    across = onp.abs(onp.diff(images, axis=2)).mean(axis=-1)
-    down = onp.abs(onp.diff(images, axis=1)).mean(axis=-1)
+    mean = onp.full(images.shape[3], 1 / images.shape[3], images.dtype)
+    across, down = (onp.abs(onp.diff(images, axis=axis)) @ mean for axis in (2, 1))
     return onp.exp(-EDGE_SHARPNESS * across), onp.exp(-EDGE_SHARPNESS * down)
 
 
@@ -93,10 +94,7 @@ def edge_aware_smoothness(field, images, valid):
     across, down = edge_weights(images)
     valid = onp.reshape(valid, images.shape[:3])
     across, down = across * (valid[:, :, 1:] & valid[:, :, :-1]), down * (valid[:, 1:] & valid[:, :-1])
-    every, after, before = slice(None), slice(1, None), slice(None, -1)
-    dx = np.abs(take(field, (every, every, after)) - take(field, (every, every, before)))
-    dy = np.abs(take(field, (every, after)) - take(field, (every, before)))
-    return np.sum(dx * across[..., None], axis=(1, 2, 3)) + np.sum(dy * down[..., None], axis=(1, 2, 3))
+    return total_variation(field, across, down)
 
 
 def flow_smoothness_loss(flow, images, valid):
@@ -125,9 +123,9 @@ def heatmap_cross_entropy(logits, cells):
 
     -log softmax(logits)[cell].  logits (B, cells), cells (B,) int -> (B,) nats.
     """
-    top = onp.max(getval(logits), axis=1)  # cancels; keeps exp in range
-    total = np.sum(np.exp(logits - top[:, None]), axis=1)
-    return top + np.log(total) - logits[onp.arange(len(cells)), cells]
+    top = onp.max(getval(logits), axis=1, keepdims=True)  # cancels; keeps exp in range
+    shifted = logits - top
+    return np.log(np.sum(np.exp(shifted), axis=1)) - take(shifted, (onp.arange(len(cells)), cells))
 
 
 def embedding_loss(predicted, observed):

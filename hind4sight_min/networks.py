@@ -10,8 +10,8 @@ import autograd.numpy as np
 import numpy as onp
 from autograd.tracer import getval
 
-from .geometry import optical_flow, so3_exp, transform_layer
-from .ops import dense_relu, max_pool, softmax, take
+from .geometry import project, so3_exp, transform_layer
+from .ops import dense, pool, softmax, take
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,31 @@ class Prediction:
     """What the forward model says of B interactions. N points, K masks (0 is the background)."""
     points: object        # (B, N, 3) m, arena: P'_{t+1}
     masks: object         # (B, N, K), summing to 1 over K
-    rotations: object     # (B, K, 3, 3)
-    translations: object  # (B, K, 3) m
+    rotations: object     # (B, K, 3, 3), in the poke's frame
+    translations: object  # (B, K, 3) m, in the poke's frame
     embedding: object     # (B, E): s'_{t+1}
 
 
 # --- inputs (fixed functions of the observation and the poke: nothing to differentiate) -----------------
+
+def window_shape(camera):
+    """(rows, columns) of the window the model looks at: half the picture high and half as wide."""
+    return (camera.height + 1) // 2, (camera.width + 1) // 2
+
+
+def windows(pokes, camera):
+    """Where the model looks: for each poke (B, 3) the rows and columns around its target, a list of B pairs of slices.
+
+    Not in the paper. A poke moves what is near its target: a quarter of the picture holds all but 0.02 % of the squared
+    motion (docs/research-log.md), and everything that runs on every point costs a quarter. What lies outside is
+    background that stays. picture[window] cuts a window out, picture[window] = part pastes it back.
+    """
+    rows, columns = window_shape(camera)
+    ahead = pokes[:, :2] + 0.02 * onp.stack([onp.cos(pokes[:, 2]), onp.sin(pokes[:, 2])], axis=1)  # things roll on
+    x, y = project(onp.column_stack([ahead, onp.full(len(pokes), 0.02)]), camera).T
+    left = onp.clip(onp.rint(x - (columns - 1) / 2), 0, camera.width - columns).astype(int)
+    top = onp.clip(onp.rint(y - (rows - 1) / 2), 0, camera.height - rows).astype(int)
+    return [(slice(t, t + rows), slice(c, c + columns)) for t, c in zip(top, left)]
 
 def fourier(values, wavelengths):
     """sin and cos of 2 pi v / w: positions as a perceptron can use them. (..., D) -> (..., 2 D len(wavelengths))."""
@@ -124,57 +143,51 @@ def init_parameters(sizes, rng, dtype=onp.float32):
     """
     params, width, head, embedding = {}, sizes.width, sizes.head, sizes.embedding
 
-    def layer(name, inputs, outputs, gain=2.0):
+    def add(name, inputs, outputs, gain=2.0):
         params[name + "_w"] = (rng.standard_normal((inputs, outputs)) * onp.sqrt(gain / inputs)).astype(dtype)
         params[name + "_b"] = onp.zeros(outputs, dtype)
 
-    layer("encoder_1", 20, embedding)
-    layer("encoder_2", embedding, embedding)
-    layer("shape_1", len(MAP_X) * len(MAP_Y), head)
-    layer("shape_2", head, width)
-    layer("trunk_0", 20 + embedding, width)
+    add("encoder_1", 20, embedding)
+    add("encoder_2", embedding, embedding)
+    add("shape_1", len(MAP_X) * len(MAP_Y), head)
+    add("shape_2", head, width)
+    add("trunk_0", 20 + embedding, width)
     for i in range(1, sizes.rounds + 1):
-        layer(f"trunk_{i}", width, width)
-        layer(f"context_{i}", 4 * width, width, gain=1.0)  # its bias is the trunk layer's
+        add(f"trunk_{i}", width, width)
+        add(f"context_{i}", 4 * width, width, gain=1.0)  # its bias is the trunk layer's
         del params[f"trunk_{i}_b"]
-    layer("mask", width, sizes.masks - 1, gain=0.01)
+    add("mask", width, sizes.masks - 1, gain=0.01)
     params["mask_b"] -= 1  # background first
-    layer("motion_1", 5 * width + 3, head)
-    layer("motion_2", head, head)
-    layer("motion_3", head, 6, gain=0.0)
-    layer("next_1", embedding + 4 * width, width)
-    layer("next_2", width, embedding, gain=0.0)
-    layer("change", 2 * 20 + 2 * embedding, width)
-    layer("cell_1", 18, width)
-    layer("cell_context", width, width, gain=1.0)  # its bias is the next layer's
-    layer("cell_2", width, width)
+    add("motion_1", 5 * width + 3, head)
+    add("motion_2", head, head)
+    add("motion_3", head, 6, gain=0.0)
+    add("next_1", embedding + 4 * width, width)
+    add("next_2", width, embedding, gain=0.0)
+    add("change", 2 * 20 + 2 * embedding, width)
+    add("cell_1", 18, width)
+    add("cell_context", width, width, gain=1.0)  # its bias is the next layer's
+    add("cell_2", width, width)
     del params["cell_2_b"]
-    layer("heatmaps", width, 2, gain=0.1)
+    add("heatmaps", width, 2, gain=0.1)
     return params
 
 
 # --- the three networks --------------------------------------------------------------------------------------
 
-def dense(params, name, x):
-    """x W + b, for a few rows.  (..., I) -> (..., O)."""
-    return np.dot(x, params[name + "_w"]) + params[name + "_b"]
+def layer(params, name, x, relu=True):
+    """The layer `name`: max(x W + b, 0), or x W + b.  (..., I) -> (..., O)."""
+    return dense(x, params[name + "_w"], params[name + "_b"], relu=relu)
 
 
-def relu(x):
-    """max(x, 0) for a few rows, as a product: autograd's derivative of np.maximum is slow."""
-    return x * (getval(x) > 0)
+def encode(params, points):
+    """The siamese encoder: features of every point. Paper: Sec. III-E, III-G.  (B, N, 3) m arena -> (B, N, E)."""
+    return layer(params, "encoder_2", layer(params, "encoder_1", encoder_features(points)))
 
 
-def encode(params, points, valid):
-    """The siamese encoder: per-point features and the scene's state embedding s. Paper: Sec. III-E, III-G.
-
-    points (B, N, 3) m arena, valid (B, N) bool -> features (B, N, E), embedding (B, E), their mean over valid
-    points.
-    """
-    x = dense_relu(encoder_features(points), params["encoder_1_w"], params["encoder_1_b"])
-    x = dense_relu(x, params["encoder_2_w"], params["encoder_2_b"])
-    mean = valid / onp.maximum(valid.sum(axis=1, keepdims=True), 1).astype(points.dtype)
-    return x, np.matmul(mean[:, None], x)[:, 0]
+def state_embedding(features, valid):
+    """s_t, the mean of the valid points' features. Paper: Sec. III-E.  (B, N, E), (B, N) bool -> (B, E)."""
+    mean = valid / onp.maximum(valid.sum(axis=1, keepdims=True), 1).astype(getval(features).dtype)
+    return np.reshape(np.matmul(mean[:, None], features), (len(mean), -1))
 
 
 MASK_BOUND = 6.0  # so a mask lies between exp(-6) / (1 + exp(-6)) and the like of 1 - exp(-6)
@@ -183,36 +196,38 @@ MASK_BOUND = 6.0  # so a mask lies between exp(-6) / (1 + exp(-6)) and the like 
 CHANGE_GAIN = 30.0
 
 
-def forward_model(params, sizes, points, valid, pokes, encoding=None):
+def forward_model(params, sizes, points, valid, pokes):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
-    points (B, N, 3) m arena; valid (B, N) bool; pokes (B, 3), (m, m, rad); encoding: `encode(params, points,
-    valid)` if already at hand -> Prediction.
+    points (B, N, 3) m arena, those of a window; valid (B, N) bool; pokes (B, 3), (m, m, rad) -> Prediction.
     """
-    features, state = encoding or encode(params, points, valid)
+    features = encode(params, points)
+    state = state_embedding(features, valid)
     local = poke_frame(points, pokes)
     pooling = pooling_weights(local, valid)
-    shape = relu(dense(params, "shape_2", relu(dense(params, "shape_1", height_map(local, valid)))))  # (B, C)
+    shape = layer(params, "shape_2", layer(params, "shape_1", height_map(local, valid)))  # (B, C)
 
     def context(h):  # (B, N, C) -> (B, 4 C)
-        pooled = np.reshape(np.matmul(pooling, h), (len(points), -1))
-        return np.concatenate([max_pool(h, valid), pooled, shape], axis=1)
+        return np.concatenate([pool(h, valid, pooling), shape], axis=1)
 
-    h = np.concatenate([poke_features(local), features], axis=2)
-    h = dense_relu(h, params["trunk_0_w"], params["trunk_0_b"])
+    h = layer(params, "trunk_0", np.concatenate([poke_features(local), features], axis=2))
     for i in range(1, sizes.rounds + 1):
-        h = h + dense_relu(h, params[f"trunk_{i}_w"], dense(params, f"context_{i}", context(h)))
+        bias = layer(params, f"context_{i}", context(h), relu=False)
+        h = dense(h, params[f"trunk_{i}_w"], bias, relu=True, residual=True)
     seen = context(h)
 
     # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (Adam
     # overshoots) would have no gradient left to come back with.
-    movers = MASK_BOUND * np.tanh(dense(params, "mask", h) / MASK_BOUND)
+    movers = MASK_BOUND * np.tanh(layer(params, "mask", h, relu=False) / MASK_BOUND)
     masks = softmax(np.concatenate([onp.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, N, K)
-    rotations, translations = _motions(params, h, masks, seen, local, valid, pokes)
-    predicted = transform_layer(points, masks, rotations, translations)  # Eq. (1)
+    rotations, translations = _motions(params, h, masks, seen, local, valid)
+    moved = transform_layer(local, masks, rotations, translations)  # Eq. (1)
+    axes, _ = poke_axes(pokes.astype(points.dtype))
+    predicted = points + np.matmul(moved - local, onp.swapaxes(axes, 1, 2))
 
-    change = relu(dense(params, "next_1", np.concatenate([state, seen], axis=1)))
-    return Prediction(predicted, masks, rotations, translations, state + dense(params, "next_2", change) / CHANGE_GAIN)
+    change = layer(params, "next_1", np.concatenate([state, seen], axis=1))
+    embedding = state + layer(params, "next_2", change, relu=False) / CHANGE_GAIN
+    return Prediction(predicted, masks, rotations, translations, embedding)
 
 
 # Of [translation, rotation], in m and rad. Adam moves every weight by the learning rate, whatever the gradient, and
@@ -221,34 +236,26 @@ def forward_model(params, sizes, points, valid, pokes, encoding=None):
 MOTION_UNIT = onp.array([0.005] * 3 + [0.1] * 3, onp.float32)
 
 
-def _motions(params, h, masks, seen, local, valid, pokes):
+def _motions(params, h, masks, seen, local, valid):
     """One rigid motion per mask, from the features pooled under it; the background's is the identity.
 
-    The network speaks in the poke frame, of a turn about the mask's centroid c and a shift t:
-    p' = R (p - c) + c + t, that is T = c - R c + t, then turned into the arena frame.
+    The network speaks of a turn about the mask's centroid c and a shift t: p' = R (p - c) + c + t, that is
+    T = c - R c + t, all in the poke frame.
     """
     moving = take(masks, (..., slice(1, None))) * valid[..., None]
-    share = np.swapaxes(moving / (np.sum(moving, axis=1, keepdims=True) + 1e-3), 1, 2)  # (B, K-1, N), sum to 1
+    total = np.matmul(onp.ones((1, h.shape[1]), local.dtype), moving)  # a sum; NumPy's own is slow along this axis
+    share = np.swapaxes(moving / (total + 1e-3), 1, 2)  # (B, K-1, N), sum to 1
     pooled, centroids = np.matmul(share, h), np.matmul(share, local)  # (B, K-1, C), (B, K-1, 3)
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
-    x = relu(dense(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2)))
-    twist = MOTION_UNIT * dense(params, "motion_3", relu(dense(params, "motion_2", x)))  # (B, K-1, 6)
-    turn = so3_exp(twist[..., 3:])
-    shift = centroids - _rotate(turn, centroids) + twist[..., :3]
-
-    # From the poke frame to the arena: with p_arena = Q p_poke + o, R -> Q R Q^T and T -> Q T + o - (Q R Q^T) o.
-    axes, origins = (value[:, None] for value in poke_axes(pokes.astype(local.dtype)))
-    rotations = np.matmul(np.matmul(axes, turn), onp.swapaxes(axes, 2, 3))
-    translations = _rotate(axes, shift) + origins - _rotate(rotations, origins)
+    x = layer(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2))
+    twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), relu=False)  # (B, K-1, 6)
+    turn = so3_exp(take(twist, (..., slice(3, None))))
+    turned = np.matmul(turn, centroids[..., None])[..., 0]
+    shift = centroids - turned + take(twist, (..., slice(0, 3)))
     identity = onp.broadcast_to(onp.eye(3, dtype=local.dtype), (batch, 1, 3, 3))
-    return (np.concatenate([identity, rotations], axis=1),
-            np.concatenate([onp.zeros((batch, 1, 3), local.dtype), translations], axis=1))
-
-
-def _rotate(matrices, vectors):
-    """R v.  (..., 3, 3), (..., 3) -> (..., 3)."""
-    return np.sum(matrices * vectors[..., None, :], axis=-1)
+    return (np.concatenate([identity, turn], axis=1),
+            np.concatenate([onp.zeros((batch, 1, 3), local.dtype), shift], axis=1))
 
 
 CHANGED_POINTS = 128  # the inverse model looks at those that changed most: a poke changes about a hundred
@@ -257,46 +264,38 @@ CHANGED_POINTS = 128  # the inverse model looks at those that changed most: a po
 def most_changed(points, next_points, valid):
     """Where the two clouds differ, pixel by pixel: the evidence of a poke.
 
-    points, next_points (B, N, 3) m; valid (B, N) bool, depth in both -> rows (B, M) int of the M most changed
-    points, and their weights (B, M), summing to 1. The weight is |P_{t+1} - P_t|^4: the power keeps the many
+    points, next_points (B, N, 3) m; valid (B, N) bool, depth in both -> the M most changed points before and after,
+    (B, M, 3) each, and their weights (B, M), summing to 1. The weight is |P_{t+1} - P_t|^4: the power keeps the many
     small differences of a noisy depth picture from outvoting the few large ones.
     """
     change = onp.sum((next_points - points) ** 2, axis=2) ** 2 * valid
     count = min(CHANGED_POINTS, change.shape[1])
     rows = onp.argpartition(-change, count - 1, axis=1)[:, :count]
     weights = onp.take_along_axis(change, rows, axis=1)
-    return rows, weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
+    pick = (onp.arange(len(points))[:, None], rows)
+    return points[pick], next_points[pick], weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
 
 
-def inverse_model(params, points, next_points, valid, features, next_features, cells):
+def inverse_model(params, before, after, weights, cells):
     """G: the poke that led from one cloud to the next, as two heat-maps. Paper: Sec. III-E.
 
-    points, next_points (B, N, 3) m arena; valid (B, N) bool, depth in both; features, next_features (B, N, E)
-    of the siamese encoder; cells (cells, 2) m, the centres of the arena's grid
+    before, after (B, M, 3) m arena, weights (B, M): what `most_changed` found in the whole picture (a window would
+    give the target away); cells (cells, 2) m, the centres of the arena's grid
     -> start logits, end logits, each (B, cells); softmax makes them heat-maps.
 
     Everything is said relative to the centre of change, so that a poke learnt in one corner of the arena is
     known in all of them.
     """
-    rows, weights = most_changed(points, next_points, valid)
-    pick = (onp.arange(len(points))[:, None], rows)
-    before, after = points[pick], next_points[pick]  # (B, M, 3)
     centre = onp.sum(weights[..., None] * (before + after), axis=1) / 2
     centre[:, 2] = 0
     x = np.concatenate([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
-                        take(features, pick), take(next_features, pick)], axis=2)
-    x = dense_relu(x, params["change_w"], params["change_b"])
-    context = np.matmul(weights[:, None], x)[:, 0]  # (B, C): what changed, seen from its centre
+                        encode(params, before), encode(params, after)], axis=2)
+    x = layer(params, "change", x)
+    context = np.reshape(np.matmul(weights[:, None], x), (len(x), -1))  # (B, C): what changed, seen from its centre
 
-    local = (cells - centre[:, None, :2]).astype(points.dtype)  # (B, cells, 2)
+    local = (cells - centre[:, None, :2]).astype(before.dtype)  # (B, cells, 2)
     y = onp.concatenate([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], axis=2)
-    y = dense_relu(y, params["cell_1_w"], params["cell_1_b"])
-    y = dense_relu(y, params["cell_2_w"], dense(params, "cell_context", context))
-    logits = dense(params, "heatmaps", y)
+    y = layer(params, "cell_1", y)
+    y = dense(y, params["cell_2_w"], layer(params, "cell_context", context, relu=False), relu=True)
+    logits = layer(params, "heatmaps", y, relu=False)
     return take(logits, (..., 0)), take(logits, (..., 1))
-
-
-def predicted_flow(prediction, points, camera):
-    """The optical flow of a prediction, (B, H, W, 2) px: the projection layer. Paper: Sec. III-C."""
-    flow = optical_flow(points, prediction.points, camera)
-    return np.reshape(flow, (len(points), camera.height, camera.width, 2))

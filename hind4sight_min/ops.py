@@ -1,8 +1,11 @@
-"""The operations whose derivative we write by hand: nearest neighbours, bilinear sampling, fused layers.
+"""The operations whose derivative we write by hand: nearest neighbours, bilinear sampling, layers, differences.
 
 Each is an autograd primitive: a forward function in NumPy, SciPy or OpenCV and its VJP (vector-Jacobian
 product: the gradient g of a scalar with respect to the output in, that with respect to each input out).
 """
+import math
+from functools import reduce
+
 import autograd.numpy as anp
 import cv2
 import numpy as np
@@ -17,7 +20,7 @@ from scipy.spatial import cKDTree
 def squared_distances(queries, references, indices):
     """d_i = |q_i - r_{indices_i}|^2.  (N, D), (M, D), (N,) int -> (N,)."""
     difference = queries - references[indices]
-    return np.sum(difference * difference, axis=1)
+    return np.einsum("ij,ij->i", difference, difference)
 
 
 def _squared_distances_vjp(argnums, ans, args, kwargs):
@@ -39,11 +42,13 @@ def _squared_distances_vjp(argnums, ans, args, kwargs):
 defvjp_argnums(squared_distances, _squared_distances_vjp)
 
 
-def nearest_squared_distances(queries, references, valid):
+def nearest_squared_distances(queries, references, valid, free=None):
     """Squared distance of every query to its nearest valid reference. Paper: Eq. (2), one direction.
 
     d_i = min_j |q_i - r_j|^2 with a SciPy KD-tree: O(N log N), where brute force is O(N M).
     queries (B, N, D), references (B, M, D), valid (B, M) bool -> (B, N), squared units of the input.
+    free (B, N), for N = M: a radius around reference i in which no other reference lies. A query i less than half of
+    it away from reference i has found its nearest, exactly, and is spared the search: most points never moved.
     The gradient flows to both sides through the neighbours found (it ignores that they may change, which
     is exact except where two references are equally near).
     Raises ValueError for other shapes, no valid reference, or points that are not finite.
@@ -56,12 +61,17 @@ def nearest_squared_distances(queries, references, valid):
         raise ValueError("queries, references: expected finite points, got NaN or infinity")
     if not valid.any(axis=1).all():
         raise ValueError("valid: expected at least one valid reference in every cloud")
-    indices = np.empty(q.shape[:2], int)
+    if free is None:
+        search = np.ones(q.shape[:2], bool)
+    else:
+        difference = q - r
+        search = ~(valid & (4 * np.einsum("bnd,bnd->bn", difference, difference) < free * free))
+    indices = np.arange(len(q))[:, None] * r.shape[1] + np.arange(q.shape[1])
     for i in range(len(q)):
         rows = np.flatnonzero(valid[i])
         # An unbalanced tree is built twice as fast, and queried as fast on clouds like ours.
         tree = cKDTree(r[i, rows], compact_nodes=False, balanced_tree=False)
-        indices[i] = rows[tree.query(q[i])[1]] + i * r.shape[1]
+        indices[i, search[i]] = rows[tree.query(q[i, search[i]])[1]] + i * r.shape[1]
     flat = squared_distances(anp.reshape(queries, (-1, q.shape[2])), anp.reshape(references, (-1, r.shape[2])),
                              indices.ravel())
     return anp.reshape(flat, q.shape[:2])
@@ -136,38 +146,47 @@ def _bilinear_image_vjp(ans, images, positions):
 defvjp(bilinear_sample, _bilinear_image_vjp, _bilinear_position_vjp)
 
 
-# --- fused network operations (speed: a cloud's features stay in the cache between the steps) --------------------
+# --- the network's layers ---------------------------------------------------------------------------------------
+#
+# autograd's bookkeeping takes some 50 us per operation, there and back: as long as a layer of 48 units takes for 768
+# points. So what belongs together is one operation here.
 
 @primitive
-def dense_relu(x, weights, bias):
-    """max(x W + b, 0) for every point.  x (B, N, I), weights (I, O), bias (O,) or (B, O) -> (B, N, O)."""
-    y = np.empty(x.shape[:2] + weights.shape[1:], x.dtype)
-    for i in range(len(x)):
-        np.dot(x[i], weights, out=y[i])
-        y[i] += bias if bias.ndim == 1 else bias[i]
-        np.maximum(y[i], 0, out=y[i])
+def dense(x, weights, bias, *, relu=False, residual=False):
+    """x W + b for every row; with relu=True max(x W + b, 0); with residual=True x is added to that.
+
+    x (..., I), weights (I, O), bias (O,) or, for x (B, N, I), one per cloud, (B, O) -> (..., O).
+    """
+    y = np.matmul(x, weights)
+    y += bias if bias.ndim == 1 else bias[:, None]
+    if relu:
+        np.maximum(y, 0, out=y)
+    if residual:
+        y += x
     return y
 
 
-def _dense_relu_vjp(argnums, ans, args, kwargs):
+def _dense_vjp(argnums, ans, args, kwargs):
     x, weights, bias = args
+    relu, residual = (kwargs.get(name, False) for name in ("relu", "residual"))
 
     def vjp(g):
-        dx = np.empty_like(x) if 0 in argnums else None
-        dw, db = np.zeros_like(weights), np.empty((len(x), weights.shape[1]), g.dtype)
-        ones = np.ones(x.shape[1], g.dtype)
-        for i in range(len(x)):
-            through = g[i] * (ans[i] > 0)  # shared by the three inputs
-            if dx is not None:
-                np.dot(through, weights.T, out=dx[i])
-            dw += np.dot(x[i].T, through)
-            np.dot(ones, through, out=db[i])  # the sum over points; BLAS is faster at it than np.sum
-        gradients = (dx, dw, db.sum(axis=0) if bias.ndim == 1 else db)
-        return [gradients[argnum] for argnum in argnums]
+        through = g * (ans > (x if residual else 0)) if relu else g
+        rows = through.reshape(-1, through.shape[-1])
+
+        def on_x():
+            dx = np.matmul(through, weights.T)
+            return np.add(dx, g, out=dx) if residual else dx
+
+        def on_bias():  # a product with ones is faster than np.sum over the rows
+            clouds = rows if bias.ndim == 1 else through
+            return np.matmul(np.ones(clouds.shape[-2], g.dtype), clouds)
+        gradients = (on_x, lambda: np.dot(x.reshape(-1, x.shape[-1]).T, rows), on_bias)
+        return [gradients[argnum]() for argnum in argnums]
     return vjp
 
 
-defvjp_argnums(dense_relu, _dense_relu_vjp)
+defvjp_argnums(dense, _dense_vjp)
 
 
 @primitive
@@ -193,19 +212,92 @@ def _take_vjp(ans, x, key):
 defvjp(take, _take_vjp, None)
 
 
-def max_pool(x, valid):
-    """Maximum over the valid points.  x (B, N, C) >= 0, valid (B, N) bool -> (B, C); 0 where none is valid."""
-    value = getval(x)
-    winners = np.argmax(value if valid.all() else value * valid[..., None], axis=1)  # (B, C)
-    cloud, channel = np.ogrid[:value.shape[0], :value.shape[2]]
-    return take(x, (cloud, winners, channel)) * valid[cloud, winners]
+@primitive
+def take_block(vector, start, shape):
+    """vector[start:start + size] as an array of `shape`: one parameter of many."""
+    return vector[start:start + math.prod(shape)].reshape(shape)
+
+
+def _take_block_vjp(ans, vector, start, shape):
+    space = vspace(vector)
+
+    def vjp(g):
+        def add_to(gradient):
+            gradient[start:start + g.size] += g.ravel()
+            return gradient
+        return SparseObject(space, add_to)
+    return vjp
+
+
+defvjp(take_block, _take_block_vjp, None, None)
+
+
+@primitive
+def pool(x, valid, weights):
+    """What a cloud holds: the maximum of every channel over the valid points, and weighted sums.
+
+    x (B, N, C) >= 0, valid (B, N) bool, weights (B, R, N) -> (B, (1 + R) C); the maximum is 0 where none is valid.
+    Its gradient goes to every valid point that has it.
+    """
+    top = x if valid.all() else x * valid[..., None].astype(x.dtype)
+    while top.shape[1] > 1:  # by halves (an odd middle twice): np.max is five times slower along this axis
+        half = (top.shape[1] + 1) // 2
+        top = np.maximum(top[:, :half], top[:, -half:])
+    return np.concatenate([top[:, 0], np.matmul(weights, x).reshape(len(x), -1)], axis=1)
+
+
+def _pool_vjp(ans, x, valid, weights):
+    def vjp(g):
+        batch, _, channels = x.shape
+        dx = np.matmul(np.swapaxes(weights, 1, 2), g[:, channels:].reshape(batch, -1, channels))
+        won = x == ans[:, None, :channels]
+        dx += (won if valid.all() else won & valid[..., None]) * g[:, None, :channels]
+        return dx
+    return vjp
+
+
+defvjp(pool, _pool_vjp, None, None)
 
 
 @primitive
 def softmax(logits):
     """exp(z_k) / sum_k exp(z_k) over the last axis, safe for large logits."""
-    e = np.exp(logits - np.max(logits, axis=-1, keepdims=True))
-    return e / np.sum(e, axis=-1, keepdims=True)
+    top = reduce(np.maximum, np.moveaxis(logits, -1, 0))  # np.max and np.sum are slow along a short last axis
+    e = np.exp(logits - top[..., None])
+    return e / _sum_last(e)
 
 
-defvjp(softmax, lambda ans, logits: lambda g: ans * (g - np.sum(g * ans, axis=-1, keepdims=True)))
+def _sum_last(x):
+    return np.matmul(x, np.ones((x.shape[-1], 1), x.dtype))
+
+
+defvjp(softmax, lambda ans, logits: lambda g: ans * (g - _sum_last(g * ans)))
+
+
+# --- steps between neighbouring pixels (Eq. 4, 5) ------------------------------------------------------------------
+
+@primitive
+def total_variation(field, across, down):
+    """sum |f(x+1, y) - f(x, y)| across(x, y) + |f(x, y+1) - f(x, y)| down(x, y), over pixels and channels.
+
+    field (B, H, W, C), weights across (B, H, W-1) and down (B, H-1, W) -> (B,).
+    """
+    dx = np.abs(np.diff(field, axis=2)) * across[..., None]
+    dy = np.abs(np.diff(field, axis=1)) * down[..., None]
+    return dx.sum(axis=(1, 2, 3)) + dy.sum(axis=(1, 2, 3))
+
+
+def _total_variation_vjp(ans, field, across, down):
+    def vjp(g):
+        dx = np.sign(np.diff(field, axis=2)) * (g[:, None, None] * across)[..., None]
+        dy = np.sign(np.diff(field, axis=1)) * (g[:, None, None] * down)[..., None]
+        result = np.zeros_like(field)  # a step pulls at both its ends
+        result[:, :, 1:] += dx
+        result[:, :, :-1] -= dx
+        result[:, 1:] += dy
+        result[:, :-1] -= dy
+        return result
+    return vjp
+
+
+defvjp(total_variation, _total_variation_vjp, None, None)

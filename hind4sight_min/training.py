@@ -12,37 +12,46 @@ from autograd import grad
 from autograd.tracer import getval
 
 from . import losses, worker_pool
+from .geometry import free_radius, optical_flow, ray_spacing
 from .interactions import (add_depth_noise, cell_centres, cells_of, load_npz, occupied_pixels, points_and_validity,
                            save_npz)
-from .networks import Sizes, encode, forward_model, init_parameters, inverse_model, predicted_flow
-from .ops import take
+from .networks import (Sizes, encode, forward_model, init_parameters, inverse_model, most_changed, state_embedding,
+                       windows)
+from .ops import take_block
 
 FORMAT = "hind4sight_min checkpoint 1"
 
 
 @dataclass
 class Batch:
-    """B interactions as the losses want them: organised clouds, float images, pokes and their two cells."""
-    points: onp.ndarray       # (B, N, 3) float32 m, arena, frame t
-    next_points: onp.ndarray  # (B, N, 3), frame t+1
-    valid: onp.ndarray        # (B, N) bool: has depth
+    """B interactions as the model and the losses want them: organised clouds, float images, pokes and their two cells.
+
+    h, w, n = h * w: the window of each picture that the model looks at (networks.windows).
+    """
+    points: onp.ndarray       # (B, n, 3) float32 m, arena, frame t
+    next_points: onp.ndarray  # (B, n, 3), frame t+1
+    valid: onp.ndarray        # (B, n) bool: has depth
     next_valid: onp.ndarray
-    shared: onp.ndarray       # (B, N) bool: valid and seen in both frames, see losses.seen_in_both
+    shared: onp.ndarray       # (B, n) bool: valid and seen in both frames, see losses.seen_in_both
     next_shared: onp.ndarray
-    images: onp.ndarray       # (B, H, W, 3) float32 in [0, 1]
+    images: onp.ndarray       # (B, h, w, 3) float32 in [0, 1]
     next_images: onp.ndarray
+    before: onp.ndarray       # (B, M, 3) m: what changed most in the whole picture, see networks.most_changed
+    after: onp.ndarray
+    change: onp.ndarray       # (B, M): its weights
     pokes: onp.ndarray        # (B, 3) float32
     start_cells: onp.ndarray  # (B,) int
     end_cells: onp.ndarray
-    cells: onp.ndarray       # (cells, 2) m: the centres of the arena's cells
+    cells: onp.ndarray        # (cells, 2) m: the centres of the arena's cells
 
 
-def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
+def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whole=False):
     """The Batch of some rows of a data set.
 
     mirror, a bool or one per row, shows the arena mirrored at its plane x = 0, which costs no new poke: pictures flip
     left-right, a_x changes sign, a_theta becomes pi - a_theta. This is exact for a camera that is symmetric about
     that plane; ValueError for another. depth_noise: SD in m of Sec. IV-B's depth noise, drawn from `rng`.
+    whole: the whole pictures instead of windows.
     """
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
@@ -57,31 +66,40 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None):
     if depth_noise:
         depth = add_depth_noise(depth, rng, depth_noise)
     points, valid = points_and_validity(depth, camera)
-    points, valid = (value.reshape(2, len(rows), -1, *value.shape[4:]) for value in (points, valid))
     empty = onp.where(mirror[:, None, None], interactions.empty_depth[:, ::-1], interactions.empty_depth)
-    shared = losses.seen_in_both(*valid, *occupied_pixels(depth, empty).reshape(valid.shape))
-    images = rgb.astype(onp.float32) / 255
-    return Batch(*points, *valid, *shared, *images, pokes, cells_of(starts, settings), cells_of(pokes[:, :2], settings),
-                 cell_centres(settings))
+    occupied = occupied_pixels(depth, empty)
+    changed = most_changed(*points.reshape(2, len(rows), -1, 3), valid.all(axis=0).reshape(len(rows), -1))
+    everything = [(slice(None), slice(None))] * len(rows)
+    parts = everything if whole else windows(pokes, camera)
+
+    def cut(pictures):  # (2, B, H, W, ...) -> (2, B, h, w, ...)
+        return onp.stack([pictures[(slice(None), i, *part)] for i, part in enumerate(parts)], axis=1)
+
+    images = cut(rgb).astype(onp.float32) / 255
+    points, valid, occupied = (value.reshape(2, len(rows), -1, *value.shape[4:])
+                               for value in map(cut, (points, valid, occupied)))
+    return Batch(*points, *valid, *losses.seen_in_both(*valid, *occupied), *images, *changed, pokes,
+                 cells_of(starts, settings), cells_of(pokes[:, :2], settings), cell_centres(settings))
 
 
 def run_model(params, sizes, batch, camera):
-    """The whole model on a batch -> (Prediction, optical flow (B, H, W, 2) px, (start, end) heat-map logits,
-    observed next embedding (B, E)). Paper: Fig. 3.
+    """The whole model on a batch -> (Prediction, optical flow (B, h, w, 2) px, (start, end) heat-map logits).
+
+    Paper: Fig. 3.
     """
-    encoding = encode(params, batch.points, batch.valid)
-    next_features, next_state = encode(params, batch.next_points, batch.next_valid)
-    prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes, encoding)
-    flow = predicted_flow(prediction, batch.points, camera)
-    heatmaps = inverse_model(params, batch.points, batch.next_points, batch.valid & batch.next_valid, encoding[0],
-                             next_features, batch.cells)
-    return prediction, flow, heatmaps, next_state
+    prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
+    flow = optical_flow(batch.points, prediction.points, camera)  # the projection layer, Sec. III-C
+    flow = np.reshape(flow, batch.images.shape[:3] + (2,))
+    return prediction, flow, inverse_model(params, batch.before, batch.after, batch.change, batch.cells)
 
 
 def loss_terms(params, sizes, batch, camera):
     """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS."""
-    prediction, flow, heatmaps, next_state = run_model(params, sizes, batch, camera)
-    maps = losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared)
+    prediction, flow, heatmaps = run_model(params, sizes, batch, camera)
+    next_embedding = state_embedding(encode(params, batch.next_points), batch.next_valid)
+    free = free_radius(batch.points, getval(prediction.points), ray_spacing(batch.points, camera))
+    maps = losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared, free,
+                                ray_spacing(batch.next_points, camera))
     return {
         "chamfer": losses.chamfer_loss(*maps),
         "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
@@ -89,7 +107,7 @@ def loss_terms(params, sizes, batch, camera):
         "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
         "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
         "inverse": losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells,
-                                       prediction.embedding, next_state),
+                                       prediction.embedding, next_embedding),
     }
 
 
@@ -101,9 +119,8 @@ def unflatten(vector, layout):
     """
     result, start = {}, 0
     for name, shape in layout.items():
-        size = math.prod(shape)
-        result[name] = np.reshape(take(vector, slice(start, start + size)), shape)
-        start += size
+        result[name] = take_block(vector, start, shape)
+        start += math.prod(shape)
     return result
 
 
@@ -238,15 +255,19 @@ def chunk_gradient(interactions, mirror, noise_seed, weights, vector, layout, re
 
 @contextmanager
 def workers(jobs):
-    """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes.
+    """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes: this one and others.
 
     Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
     """
     if jobs == 1:
         yield lambda arguments: [chunk_gradient(*each) for each in arguments]
         return
-    with worker_pool(jobs) as pool:
-        yield lambda arguments: [job.result() for job in [pool.submit(chunk_gradient, *each) for each in arguments]]
+    with worker_pool(jobs - 1) as pool:
+        def apply(arguments):
+            given = {i: pool.submit(chunk_gradient, *each) for i, each in enumerate(arguments) if i % jobs}
+            own = {i: chunk_gradient(*each) for i, each in enumerate(arguments) if not i % jobs}
+            return [given[i].result() if i in given else own[i] for i in range(len(arguments))]
+        yield apply
 
 
 def training_step(interactions, run, gradients):

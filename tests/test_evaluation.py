@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_training import SETTINGS, TINY, pokes_seen
+from test_training import SETTINGS, TINY, pokes_seen, random_run
 
 from hind4sight_min import evaluation
 from hind4sight_min.interactions import Truth, cell_centres, cells_of
-from hind4sight_min.networks import Prediction
-from hind4sight_min.training import make_batch, start_run
+from hind4sight_min.networks import Prediction, windows
+from hind4sight_min.training import make_batch, run_model, start_run
 
 
 def shifted_block(data, shift):
@@ -24,7 +24,7 @@ def shifted_block(data, shift):
 def oracle(monkeypatch, data, truth, share, drift=0.0):
     """Make `predict` return `share` of the true motion, `drift` (m) on still points, and perfect heat-maps."""
     def predict(run, interactions, rows):
-        batch = make_batch(interactions, rows)
+        batch = make_batch(interactions, rows, whole=True)
         moves = np.zeros_like(batch.points) + np.float32(drift) * np.array([1, 0, 0], np.float32)
         masks = np.zeros(batch.points.shape[:2] + (3,))
         masks[..., 0] = 0.5
@@ -94,6 +94,25 @@ def test_missing_depth_is_not_scored(monkeypatch):
     assert found["all_epe_cm"] == pytest.approx(6 * 2.5 / 186, rel=1e-4)
 
 
+def test_predict_pastes_the_windows_into_the_picture():
+    data, run = pokes_seen(), random_run()
+    rows = np.array([0, 3, 5])
+    whole, prediction, flow, *_ = evaluation.predict(run, data, rows)
+    batch = make_batch(data, rows)
+    expected, window_flow, _ = run_model(run.params, run.recipe.sizes, batch, data.camera)
+    for i, (rows_in, columns_in) in enumerate(windows(data.pokes[rows], data.camera)):
+        inside = np.zeros((12, 16), bool)
+        inside[rows_in, columns_in] = True
+        np.testing.assert_array_equal(flow[i][inside], window_flow[i].reshape(-1, 2))
+        assert not flow[i][~inside].any()
+        points, masks = prediction.points[i].reshape(12, 16, 3), prediction.masks[i].reshape(12, 16, 3)
+        np.testing.assert_array_equal(points[inside], expected.points[i])
+        np.testing.assert_array_equal(points[~inside], whole.points[i].reshape(12, 16, 3)[~inside])
+        np.testing.assert_array_equal(masks[inside], expected.masks[i])
+        np.testing.assert_array_equal(masks[~inside], np.tile([1, 0, 0], (12 * 16 - 6 * 8, 1)))
+        assert np.abs(flow[i][inside]).max() > 1e-3
+
+
 def test_metrics_of_a_real_model_are_finite():
     data = pokes_seen()
     found = evaluation.evaluate(start_run(TINY, data), data, shifted_block(data, (0.03, 0, 0)))
@@ -145,7 +164,7 @@ def test_turned_object_is_scored_point_by_point(monkeypatch):
     # A pure rotation: the centre hardly moves, the rim does. No motion must cost what the rim moves.
     data = pokes_seen()
     truth = shifted_block(data, (0, 0, 0))
-    points = make_batch(data, np.array([0])).points[0][(truth.labels[0] == 1).ravel()]
+    points = make_batch(data, np.array([0]), whole=True).points[0][(truth.labels[0] == 1).ravel()]
     centre = points.mean(axis=0)
     truth.poses_before[:, 0, :3] = truth.poses_after[:, 0, :3] = centre
     turn = Rotation.from_rotvec([0, 0, 0.5])

@@ -8,8 +8,8 @@ from autograd.test_util import check_grads
 from scipy.linalg import expm, expm_frechet
 from scipy.spatial.transform import Rotation
 
-from hind4sight_min.geometry import (MIN_DEPTH, Camera, look_at, optical_flow, project, rigid, so3_exp,
-                                     transform_layer, unproject)
+from hind4sight_min.geometry import (MIN_DEPTH, Camera, free_radius, look_at, optical_flow, project, ray_spacing, rigid,
+                                     so3_exp, transform_layer, unproject)
 
 WIDTH, HEIGHT = 7, 5  # not square, and fx != fy, so that swapped axes show
 FX, FY, CX, CY = 60.0, 70.0, 3.2, 1.7
@@ -369,6 +369,41 @@ def test_transform_layer_refuses_other_shapes(which, shape):
     inputs[which] = np.ones(shape)
     with pytest.raises(ValueError, match="points.*masks.*rotations.*translations"):
         transform_layer(*inputs)
+
+
+# --- which points cannot be near each other -----------------------------------------------------------------
+
+def nearest_other(points):
+    """The distance of every point (N, 3) to the nearest other one, over all pairs."""
+    pairs = np.linalg.norm(points[:, None] - points, axis=2)
+    np.fill_diagonal(pairs, np.inf)
+    return pairs.min(axis=1)
+
+
+def test_ray_spacing_is_below_the_distance_to_every_other_point_but_not_far_below():
+    rng, camera = np.random.default_rng(15), make_camera()
+    for spread in (0.0, 0.02, 0.5):  # a flat picture, a rough one, and one of single points
+        depth = 0.7 + spread * rng.uniform(-1, 1, (HEIGHT, WIDTH))
+        points = unproject(depth, camera).reshape(-1, 3)
+        spacing = ray_spacing(points, camera)
+        assert spacing.shape == (HEIGHT * WIDTH,)
+        assert (spacing < nearest_other(points)).all()
+        if not spread:
+            assert (spacing > 0.4 * nearest_other(points)).all()
+
+
+def test_free_radius_is_below_the_distance_to_every_other_predicted_point():
+    rng, camera = np.random.default_rng(16), make_camera()
+    points = unproject(0.7 + 0.01 * rng.random((4, HEIGHT, WIDTH)), camera).reshape(4, -1, 3)
+    predicted = points + 1e-4 * rng.uniform(-1, 1, points.shape)
+    for i, count in ((1, 1), (2, 4), (3, points.shape[1])):  # none, one, some and all move
+        predicted[i, :count] += rng.uniform(-0.05, 0.05, (count, 3))
+    radius = free_radius(points, predicted, ray_spacing(points, camera))
+    for i, count in enumerate((0, 1, 4, points.shape[1])):
+        assert (radius[i] <= nearest_other(predicted[i])).all()
+        assert not radius[i, :count].any()
+        if count < 4:
+            assert (radius[i, count:] > 0).mean() > 0.5
 
 
 # --- dtype ------------------------------------------------------------------------------------------------

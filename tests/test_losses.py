@@ -8,6 +8,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import log_softmax, softmax
 
 from hind4sight_min import losses
+from hind4sight_min.geometry import Camera, free_radius, look_at, ray_spacing, unproject
 from hind4sight_min.losses import (PAPER_WEIGHTS, chamfer_loss, distance_maps, distance_smoothness_loss,
                                    edge_aware_smoothness, edge_weights, embedding_loss, flow_smoothness_loss, full_loss,
                                    heatmap_cross_entropy, inverse_loss, photometric_loss, seen_in_both, warp_backward)
@@ -99,6 +100,32 @@ def test_distance_maps_and_gradients_match_brute_force(share):
         np.testing.assert_allclose(gradient, gradients[argnum], rtol=0, atol=1e-12)
         assert not gradient[~inputs[2 + argnum]].any() and gradient[inputs[2 + argnum]].any()
     check_grads(weighted, (0, 1), modes=["rev"], order=1)(*inputs[:2])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_points_spared_the_search_have_the_distances_and_gradients_of_those_searched(noise):
+    rng, camera = np.random.default_rng(19), Camera(16, 12, 20.0, 20.0, 7.5, 5.5, look_at([0, -0.46, 0.62], [0, 0, 0]))
+    before = 0.75 + 0.02 * rng.random((3, 12, 16))
+    after = before + noise * rng.standard_normal(before.shape)
+    after[:, 3:6, 4:8] -= 0.04
+    points, observed = (unproject(depth, camera).reshape(3, -1, 3) for depth in (before, after))
+    predicted = points + 1e-4 * rng.standard_normal(points.shape)
+    predicted[:, 50:70] += rng.uniform(-0.04, 0.04, (3, 20, 3))
+    valid, next_valid = rng.random((2, 3, 192)) < 0.9
+    free = free_radius(points, predicted, ray_spacing(points, camera)), ray_spacing(observed, camera)
+    g = rng.standard_normal((2, 3, 192))
+
+    def total(predicted, observed, *free):
+        here, there = distance_maps(predicted, observed, valid, next_valid, *free)
+        return anp.sum(g[0] * here) + anp.sum(g[1] * there)
+    for found, expected in zip(distance_maps(predicted, observed, valid, next_valid, *free),
+                               distance_maps(predicted, observed, valid, next_valid)):
+        np.testing.assert_array_equal(found, expected)
+    for argnum in (0, 1):
+        np.testing.assert_array_equal(grad(total, argnum)(predicted, observed, *free),
+                                      grad(total, argnum)(predicted, observed))
+    spared = 4 * ((predicted - observed) ** 2).sum(axis=2) < free[1] ** 2
+    assert spared.any() and not spared.all() and (noise or spared.mean() > 0.5)
 
 
 def test_chamfer_loss_is_squared_both_ways_and_summed():

@@ -3,9 +3,10 @@ import pytest
 from autograd import grad
 
 from hind4sight_min import networks
-from hind4sight_min.networks import (Sizes, encode, encoder_features, forward_model, fourier, height_map,
-                                     init_parameters, inverse_model, most_changed, poke_axes, poke_features,
-                                     poke_frame, pooling_weights)
+from hind4sight_min.geometry import Camera, look_at, project
+from hind4sight_min.networks import (Sizes, encoder_features, forward_model, fourier, height_map, init_parameters,
+                                     inverse_model, most_changed, poke_axes, poke_features, poke_frame,
+                                     pooling_weights, state_embedding, windows)
 
 SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6)
 
@@ -94,10 +95,8 @@ def test_gradient_of_every_parameter_against_finite_differences(name):
 
     def scalar(value):
         p = {**params, name: value}
-        encoding = encode(p, points, valid)
-        next_features, _ = encode(p, next_points, valid)
-        prediction = forward_model(p, SIZES, points, valid, pokes, encoding)
-        start, end = inverse_model(p, points, next_points, valid, encoding[0], next_features, cells)
+        prediction = forward_model(p, SIZES, points, valid, pokes)
+        start, end = inverse_model(p, *most_changed(points, next_points, valid), cells)
         return sum((a * b).sum() for a, b in zip((prediction.points, prediction.embedding, start, end), readout))
 
     direction = rng.standard_normal(params[name].shape)
@@ -119,17 +118,16 @@ def test_siamese_encoder_serves_both_models():
 
     def inverse(w):
         p = {**params, "encoder_1_w": w}
-        return inverse_model(p, points, next_points, valid, encode(p, points, valid)[0],
-                             encode(p, next_points, valid)[0], cells)[0][:, 0].sum()
+        return inverse_model(p, *most_changed(points, next_points, valid), cells)[0][:, 0].sum()
     for model in (forward, inverse):
         assert np.abs(grad(model)(params["encoder_1_w"])).max() > 1e-6
 
 
-def test_embedding_is_the_mean_over_valid_points():
+def test_state_embedding_is_the_mean_over_valid_points():
     rng = np.random.default_rng(7)
-    points, valid, _ = scene(rng)
+    features, valid = rng.standard_normal((2, 40, 6)), np.ones((2, 40), bool)
     valid[0, :15] = False
-    features, embedding = encode(random_parameters(rng), points, valid)
+    embedding = state_embedding(features, valid)
     np.testing.assert_allclose(embedding[0], features[0, 15:].mean(axis=0))
     np.testing.assert_allclose(embedding[1], features[1].mean(axis=0))
 
@@ -137,14 +135,45 @@ def test_embedding_is_the_mean_over_valid_points():
 def test_inverse_model_moves_with_the_change():
     # The same change 7 cm further on is the same poke 7 cm further on, seen on cells 7 cm further on.
     rng = np.random.default_rng(8)
-    points, valid, _ = scene(rng)
-    next_points = points + 0.02 * rng.standard_normal(points.shape)
+    before, _, _ = scene(rng)
+    after = before + 0.02 * rng.standard_normal(before.shape)
+    weights = rng.dirichlet(np.ones(40), 2)
     params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
-    features = rng.standard_normal((2, 2, 40, 6))
-    first = inverse_model(params, points, next_points, valid, *features, cells)
+    params["change_w"][40:] = 0  # what comes from the encoder is tied to the arena: switch it off
+    first = inverse_model(params, before, after, weights, cells)
     shift = np.array([0.07, -0.03, 0])
-    second = inverse_model(params, points + shift, next_points + shift, valid, *features, cells + shift[:2])
+    second = inverse_model(params, before + shift, after + shift, weights, cells + shift[:2])
     np.testing.assert_allclose(second, first, atol=1e-9)
+
+
+def camera(width, height):
+    return Camera(width, height, 1.2 * width, 1.2 * width, (width - 1) / 2, (height - 1) / 2,
+                  look_at([0, -0.46, 0.62], [0, 0, 0]))
+
+
+@pytest.mark.parametrize("width, height", [(64, 48), (17, 13)])
+def test_windows_hold_the_target_in_their_middle_and_stay_in_the_picture(width, height):
+    rng, cam = np.random.default_rng(11), camera(width, height)
+    pokes = np.column_stack([rng.uniform(-0.3, 0.3, (200, 2)), rng.uniform(-3, 3, 200)])
+    picture, middle = np.zeros((height, width)), 0
+    for poke, (rows, columns) in zip(pokes, windows(pokes, cam)):
+        assert picture[rows, columns].shape == ((height + 1) // 2, (width + 1) // 2)
+        assert rows.start >= 0 and columns.start >= 0 and rows.stop <= height and columns.stop <= width
+        x, y = project(np.array([poke[0] + 0.02 * np.cos(poke[2]), poke[1] + 0.02 * np.sin(poke[2]), 0.02]), cam)
+        free = 0 < rows.start and rows.stop < height and 0 < columns.start and columns.stop < width
+        if free:
+            middle += 1
+            assert abs((rows.start + rows.stop - 1) / 2 - y) <= 0.5 + 1e-9
+            assert abs((columns.start + columns.stop - 1) / 2 - x) <= 0.5 + 1e-9
+    assert middle > 20
+
+
+def test_windows_of_a_mirrored_poke_are_mirrored():
+    rng, cam = np.random.default_rng(12), camera(64, 48)
+    pokes = np.column_stack([rng.uniform(-0.2, 0.2, (50, 2)), rng.uniform(-3, 3, 50)])
+    for (rows, columns), (other_rows, other) in zip(windows(pokes, cam),
+                                                    windows(pokes * [-1, 1, -1] + [0, 0, np.pi], cam)):
+        assert rows == other_rows and (columns.start, columns.stop) == (64 - other.stop, 64 - other.start)
 
 
 def test_most_changed_finds_the_moved_points_and_ignores_missing_depth(monkeypatch):
@@ -156,11 +185,14 @@ def test_most_changed_finds_the_moved_points_and_ignores_missing_depth(monkeypat
     next_points[:, moved] += rng.uniform(0.02, 0.05, (2, 5, 3))
     next_points[:, 0] += 1.0
     valid[:, 0] = False
-    rows, weights = most_changed(points, next_points, valid)
-    np.testing.assert_array_equal(np.sort(rows, axis=1), [moved, moved])
+    before, after, weights = most_changed(points, next_points, valid)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
-    lengths = np.linalg.norm(next_points - points, axis=2)
-    np.testing.assert_allclose(weights[0], lengths[0, rows[0]] ** 4 / (lengths[0, rows[0]] ** 4).sum())
+    for b in range(2):
+        rows = [np.flatnonzero((points[b] == point).all(axis=1))[0] for point in before[b]]
+        np.testing.assert_array_equal(np.sort(rows), moved)
+        np.testing.assert_array_equal(after[b], next_points[b, rows])
+        lengths = np.linalg.norm(after[b] - before[b], axis=1)
+        np.testing.assert_allclose(weights[b], lengths ** 4 / (lengths ** 4).sum())
 
 
 def test_poke_frame_against_hand_values():

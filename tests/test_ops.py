@@ -1,4 +1,4 @@
-"""Nearest neighbours, bilinear sampling and the fused network operations: values and gradients."""
+"""Nearest neighbours, bilinear sampling layers and differences: values and gradients."""
 import autograd.numpy as anp
 import cv2
 import numpy as np
@@ -8,8 +8,8 @@ from autograd import elementwise_grad, grad
 from autograd.test_util import check_grads
 from scipy.ndimage import map_coordinates
 
-from hind4sight_min.ops import (bilinear_sample, dense_relu, max_pool, nearest_squared_distances, softmax,
-                                squared_distances, take)
+from hind4sight_min.ops import (bilinear_sample, dense, nearest_squared_distances, pool, softmax, squared_distances,
+                                take, take_block, total_variation)
 
 CV2_MAJOR = int(cv2.__version__.split(".")[0])
 
@@ -273,37 +273,70 @@ def test_bilinear_sample_refuses_positions_that_are_not_finite(bad):
         bilinear_sample(np.ones((2, 4, 5, 3)), positions)
 
 
-# --- fused network operations -----------------------------------------------------------------------------
+# --- the network's layers ---------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("per_cloud", [False, True])
-def test_dense_relu_and_gradients_match_numpy(per_cloud):
+@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("shape, per_cloud", [((3, 5, 4), False), ((3, 5, 4), True), ((7, 4), False)])
+def test_dense_and_its_gradients_match_numpy(shape, per_cloud, relu):
     rng = np.random.default_rng(9)
-    x, weights = rng.normal(size=(3, 5, 4)), rng.normal(size=(4, 6))
-    bias, g = rng.normal(size=(3, 6) if per_cloud else 6), rng.normal(size=(3, 5, 6))
-    before = np.einsum("bni,io->bno", x, weights) + (bias[:, None] if per_cloud else bias)
-    value = dense_relu(x, weights, bias)
-    assert value.shape == (3, 5, 6)
-    np.testing.assert_allclose(value, np.maximum(before, 0), rtol=0, atol=1e-12)
-    through = g * (before > 0)
-    assert 20 < (before > 0).sum() < 70  # both sides of the kink
-    expected = (np.einsum("bno,io->bni", through, weights), np.einsum("bno,bni->io", through, x),
-                through.sum(axis=1) if per_cloud else through.sum(axis=(0, 1)))
-    together = grad(lambda args: anp.sum(g * dense_relu(*args)))((x, weights, bias))
+    x, weights, bias = rng.normal(size=shape), rng.normal(size=(4, 6)), rng.normal(size=(3, 6) if per_cloud else 6)
+    g = rng.normal(size=shape[:-1] + (6,))
+
+    def layer(x, weights, bias):
+        return dense(x, weights, bias, relu=relu)
+    before = np.einsum("...i,io->...o", x, weights) + (bias[:, None] if per_cloud else bias)
+    value = layer(x, weights, bias)
+    assert value.shape == g.shape
+    np.testing.assert_allclose(value, np.maximum(before, 0) if relu else before, rtol=0, atol=1e-12)
+    through = g * ((before > 0) if relu else 1)
+    assert 0.2 < (before > 0).mean() < 0.8  # both sides of the kink
+    flat = through.reshape(-1, 6)
+    expected = (np.einsum("...o,io->...i", through, weights), np.einsum("no,ni->io", flat, x.reshape(-1, 4)),
+                through.sum(axis=1) if per_cloud else flat.sum(axis=0))
+    together = grad(lambda args: anp.sum(g * layer(*args)))((x, weights, bias))
     for argnum, wanted in enumerate(expected):
-        alone = pulled_back(dense_relu, argnum, g, x, weights, bias)
+        alone = pulled_back(layer, argnum, g, x, weights, bias)
         for found in (alone, together[argnum]):
             assert found.shape == wanted.shape
             np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12)
-    check_grads(dense_relu, (0, 1, 2), modes=["rev"], order=1)(x, weights, bias)
+    check_grads(layer, (0, 1, 2), modes=["rev"], order=1)(x, weights, bias)
 
 
-def test_dense_relu_changes_none_of_its_inputs():
+def test_a_residual_layer_adds_its_input():
+    rng = np.random.default_rng(22)
+    x, weights, bias = rng.normal(size=(3, 5, 4)), rng.normal(size=(4, 4)), rng.normal(size=(3, 4))
+    g = rng.normal(size=(3, 5, 4))
+    args = (x, weights, bias)
+
+    def residual(*args):
+        return dense(*args, relu=True, residual=True)
+
+    def plain(*args):
+        return args[0] + dense(*args, relu=True)
+    np.testing.assert_allclose(residual(*args), plain(*args), rtol=1e-12)
+    for argnum in range(3):
+        np.testing.assert_allclose(pulled_back(residual, argnum, g, *args), pulled_back(plain, argnum, g, *args),
+                                   rtol=0, atol=1e-12)
+    check_grads(residual, (0, 1, 2), modes=["rev"], order=1)(*args)
+
+
+def test_dense_changes_none_of_its_inputs():
     rng = np.random.default_rng(10)
     inputs = [rng.normal(size=shape) for shape in ((2, 3, 4), (4, 5), (2, 5))]
     copies = [value.copy() for value in inputs]
-    dense_relu(*inputs)
+    dense(*inputs, relu=True)
+    pulled_back(lambda *args: dense(*args, relu=True), 0, 1.0, *inputs)
     for value, copy in zip(inputs, copies):
         np.testing.assert_array_equal(value, copy)
+
+
+def test_take_block_and_its_gradient():
+    rng = np.random.default_rng(21)
+    vector, g = rng.normal(size=11), rng.normal(size=(2, 3))
+    np.testing.assert_array_equal(take_block(vector, 4, (2, 3)), vector[4:10].reshape(2, 3))
+    np.testing.assert_array_equal(pulled_back(take_block, 0, g, vector, 4, (2, 3)), [0] * 4 + [*g.ravel()] + [0])
+    twice = grad(lambda v: anp.sum(take_block(v, 4, (2, 3)) * g) + 2 * anp.sum(take_block(v, 8, (3,))))(vector)
+    np.testing.assert_allclose(twice, np.r_[[0] * 4, g.ravel(), 0] + np.r_[[0] * 8, 2, 2, 2])
 
 
 @pytest.mark.parametrize("key", [
@@ -333,38 +366,43 @@ def test_gradients_of_overlapping_takes_add_up():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
-def test_max_pool_and_its_gradient_see_the_valid_points_only(share):
+def test_pool_and_its_gradient_match_a_loop(share):
     rng = np.random.default_rng(13)
-    x, valid, g = rng.random((3, 6, 4)), rng.random((3, 6)) < share, rng.normal(size=(3, 4))
+    x, valid, weights = rng.random((3, 6, 4)), rng.random((3, 6)) < share, rng.random((3, 2, 6))
     x[~valid] += 5  # the largest of all, were they counted
-    value, expected, gradient = max_pool(x, valid), np.zeros((3, 4)), np.zeros_like(x)
+    g = rng.normal(size=(3, 12))
+    value, expected, gradient = pool(x, valid, weights), np.zeros((3, 12)), np.zeros_like(x)
     for b, c in np.ndindex(3, 4):
         rows = np.flatnonzero(valid[b])
         winner = rows[np.argmax(x[b, rows, c])]
-        expected[b, c], gradient[b, winner, c] = x[b, winner, c], g[b, c]
-    assert value.shape == (3, 4)
-    np.testing.assert_array_equal(value, expected)
-    found = pulled_back(max_pool, 0, g, x, valid)
+        expected[b, c] = x[b, winner, c]
+        gradient[b, winner, c] += g[b, c]
+        for r in range(2):
+            expected[b, 4 * (r + 1) + c] = weights[b, r] @ x[b, :, c]
+            gradient[b, :, c] += weights[b, r] * g[b, 4 * (r + 1) + c]
+    assert value.shape == (3, 12)
+    np.testing.assert_allclose(value, expected, rtol=1e-12)
+    found = pulled_back(pool, 0, g, x, valid, weights)
     assert found.shape == x.shape
-    np.testing.assert_array_equal(found, gradient)
-    check_grads(max_pool, modes=["rev"], order=1)(x, valid)
+    np.testing.assert_allclose(found, gradient, rtol=0, atol=1e-12)
+    check_grads(pool, modes=["rev"], order=1)(x, valid, weights)
 
 
-def test_max_pool_is_zero_with_zero_gradient_where_nothing_is_valid():
-    x = np.random.default_rng(14).random((2, 3, 4)) + 1
+def test_the_maximum_is_zero_with_zero_gradient_where_nothing_is_valid():
+    x, weights = np.random.default_rng(14).random((2, 3, 4)) + 1, np.zeros((2, 1, 3))
     valid = np.array([[False, False, False], [False, True, False]])
     expected = np.zeros_like(x)
     expected[1, 1] = 1
-    np.testing.assert_array_equal(max_pool(x, valid), [np.zeros(4), x[1, 1]])
-    np.testing.assert_array_equal(pulled_back(max_pool, 0, 1.0, x, valid), expected)
+    np.testing.assert_array_equal(pool(x, valid, weights)[:, :4], [np.zeros(4), x[1, 1]])
+    np.testing.assert_array_equal(pulled_back(pool, 0, 1.0, x, valid, weights), expected)
 
 
-def test_max_pool_of_zeros_does_not_pick_an_invalid_point():
-    x = np.zeros((1, 3, 2))
+def test_the_maximum_of_zeros_is_not_that_of_an_invalid_point():
+    x, weights = np.zeros((1, 3, 2)), np.zeros((1, 1, 3))
     x[0, 0] = 7  # invalid, first, and as large as the valid ones once masked
     valid = np.array([[False, True, True]])
-    np.testing.assert_array_equal(max_pool(x, valid), [[0, 0]])
-    assert not pulled_back(max_pool, 0, 1.0, x, valid)[0, 0].any()
+    np.testing.assert_array_equal(pool(x, valid, weights), [[0, 0, 0, 0]])
+    assert not pulled_back(pool, 0, 1.0, x, valid, weights)[0, 0].any()
 
 
 def test_softmax_and_its_gradient_match_scipy_and_finite_differences():
@@ -393,7 +431,29 @@ def test_softmax_of_huge_logits_neither_overflows_nor_underflows(dtype, shift):
     np.testing.assert_allclose(gradient, [(np.diag(p) - np.outer(p, p)) @ [1, -2, 3], [0, 0, 0]], atol=1e-6)
 
 
+# --- steps between neighbouring pixels (Eq. 4, 5) -----------------------------------------------------------
+
+def test_total_variation_and_its_gradient_match_autograd_of_the_plain_formula():
+    rng = np.random.default_rng(18)
+    field, across, down = rng.normal(size=(2, 4, 5, 3)), rng.random((2, 4, 4)), rng.random((2, 3, 5))
+    g = np.array([1.5, -0.5])
+
+    def plain(field):
+        dx = anp.sum(anp.abs(field[:, :, 1:] - field[:, :, :-1]), axis=3)
+        dy = anp.sum(anp.abs(field[:, 1:] - field[:, :-1]), axis=3)
+        return anp.sum(dx * across, axis=(1, 2)) + anp.sum(dy * down, axis=(1, 2))
+    np.testing.assert_allclose(total_variation(field, across, down), plain(field), rtol=1e-12)
+    found = pulled_back(total_variation, 0, g, field, across, down)
+    np.testing.assert_allclose(found, grad(lambda field: anp.sum(g * plain(field)))(field), rtol=0, atol=1e-12)
+    assert np.abs(found).min() > 1e-3
+    check_grads(lambda field: total_variation(field, across, down), modes=["rev"], order=1)(field)
+
+
 # --- dtype ------------------------------------------------------------------------------------------------
+
+def dense_relu(x, weights, bias):
+    return dense(x, weights, bias, relu=True)
+
 
 def dtype_cases():
     rng = np.random.default_rng(16)
@@ -408,13 +468,17 @@ def dtype_cases():
     yield bilinear_sample, 0, (images, positions - 1 / 64)
     yield bilinear_sample, 1, (images, positions)  # a position on the grid may be a kink
     for argnum in range(3):
+        yield dense, argnum, (x, weights, bias)
+        yield dense, argnum, (x, weights, rng.normal(size=(2, 4)))
         yield dense_relu, argnum, (x, weights, bias)
-        yield dense_relu, argnum, (x, weights, rng.normal(size=(2, 4)))
     yield take, 0, (x, (slice(None), slice(1, 3)))
     yield take, 0, (x, (np.array([1, 0]), np.array([3, 4])))
-    yield max_pool, 0, (np.abs(x), np.ones((2, 5), bool))
-    yield max_pool, 0, (np.abs(x), np.array([[True, False, True, True, False]] * 2))
+    yield take_block, 0, (bias, 1, (3, 1))
+    pooling = rng.random((2, 2, 5))
+    yield pool, 0, (np.abs(x), np.ones((2, 5), bool), pooling)
+    yield pool, 0, (np.abs(x), np.array([[True, False, True, True, False]] * 2), pooling)
     yield softmax, 0, (x,)
+    yield total_variation, 0, (images, rng.random((2, 4, 4)), rng.random((2, 3, 5)))
 
 
 @pytest.mark.parametrize("function, argnum, args", [

@@ -7,7 +7,7 @@ import pytest
 from hind4sight_min import losses, training
 from hind4sight_min.geometry import Camera, look_at, project, unproject
 from hind4sight_min.interactions import Interactions, cells_of
-from hind4sight_min.networks import Sizes
+from hind4sight_min.networks import Sizes, windows
 from hind4sight_min.training import Recipe, batch_gradient, make_batch, start_run, train, unflatten
 
 SETTINGS = {"arena": 0.5, "cell": 0.025}
@@ -158,7 +158,7 @@ def test_every_epoch_shows_every_row_once():
 
 def test_the_mirrored_batch_is_the_mirrored_world():
     data = pokes_seen()
-    plain, mirrored = make_batch(data, np.arange(3)), make_batch(data, np.arange(3), mirror=True)
+    plain, mirrored = (make_batch(data, np.arange(3), mirror=mirror, whole=True) for mirror in (False, True))
     flip = [-1, 1, 1]
     for name in ("points", "next_points"):
         there = getattr(mirrored, name).reshape(3, 12, 16, 3)[:, :, ::-1] * flip
@@ -189,7 +189,7 @@ def test_only_the_marked_rows_are_mirrored():
 def test_batch_against_the_data():
     data = pokes_seen()
     data.depth_before[1, 3, 4] = 0
-    batch = make_batch(data, np.array([1, 4]))
+    batch = make_batch(data, np.array([1, 4]), whole=True)
     np.testing.assert_array_equal(batch.points.reshape(2, 12, 16, 3), unproject(data.depth_before[[1, 4]], data.camera))
     assert (~batch.valid).sum() == 1 and not batch.valid[0, 3 * 16 + 4] and batch.next_valid.all()
     np.testing.assert_allclose(batch.next_images, data.rgb_after[[1, 4]] / 255, atol=1e-7)
@@ -202,6 +202,21 @@ def test_batch_against_the_data():
             assert batch.shared[i, k] == (before > 0 and not (will_stand and not stands))
             assert batch.next_shared[i, k] == (after > 0 and not (stands and not will_stand))
     assert 0 < (~batch.shared).sum() < 30 and 0 < (~batch.next_shared).sum() < 30
+
+
+def test_a_window_is_cut_out_of_every_picture():
+    data = pokes_seen()
+    rows, mirror = np.array([1, 4, 2]), [False, True, False]
+    whole, batch = make_batch(data, rows, mirror, whole=True), make_batch(data, rows, mirror)
+    for i, part in enumerate(windows(whole.pokes, data.camera)):
+        for name in ("points", "next_points", "valid", "next_valid", "shared", "next_shared"):
+            picture = getattr(whole, name)[i]
+            picture = picture.reshape(12, 16, *picture.shape[1:])
+            np.testing.assert_array_equal(getattr(batch, name)[i], picture[part].reshape(48, *picture.shape[2:]))
+        for name in ("images", "next_images"):
+            np.testing.assert_array_equal(getattr(batch, name)[i], getattr(whole, name)[i][part])
+    for name in ("before", "after", "change", "pokes", "start_cells", "end_cells"):  # these are of the whole picture
+        np.testing.assert_array_equal(getattr(batch, name), getattr(whole, name))
 
 
 def test_mirroring_needs_a_symmetric_camera():
