@@ -5,6 +5,8 @@ Every loss returns (B,): the sum over pixels as printed in the paper, per intera
 over the batch. `valid` (B, N) marks the pixels that count: the others neither attract nor cost anything. In
 training these are the pixels with depth that both frames show (`seen_in_both`); flow is smooth wherever there is depth.
 """
+from functools import lru_cache
+
 import autograd.numpy as np
 import numpy as onp
 from autograd.tracer import getval
@@ -55,13 +57,20 @@ def warp_backward(next_images, flow):
     Paper: Sec. III-C.  I'_t(x, y) = I_{t+1}(x + U, y + V), bilinear.
     next_images (B, H, W, C), flow (B, H, W, 2) px -> warped (B, H, W, C), in_view (B, H, W) bool.
     """
-    batch, height, width, _ = next_images.shape
-    v, u = onp.mgrid[:height, :width]
-    positions = onp.stack([u, v], axis=-1).astype(getval(flow).dtype) + flow
+    height, width = next_images.shape[1:3]
+    positions = flow + _pixel_grid(height, width, getval(flow).dtype.type)
     where, margin = getval(positions), 1e-3  # px: rounding must not carry the rim's still pixels out of view
-    in_view = ((where >= -margin) & (where <= [width - 1 + margin, height - 1 + margin])).all(axis=-1)
-    warped = bilinear_sample(next_images, np.reshape(positions, (batch, -1, 2)))
-    return np.reshape(warped, next_images.shape), in_view
+    # One axis after the other: NumPy is slow at small ones.
+    in_view = [(where[..., axis] >= -margin) & (where[..., axis] <= size - 1 + margin)
+               for axis, size in enumerate((width, height))]
+    return bilinear_sample(next_images, positions), in_view[0] & in_view[1]
+
+
+@lru_cache(maxsize=4)
+def _pixel_grid(height, width, dtype):
+    """(height, width, 2): every pixel's own position (x, y)."""
+    y, x = onp.mgrid[:height, :width]
+    return onp.stack([x, y], axis=-1).astype(dtype)
 
 
 def photometric_loss(images, next_images, flow, valid):

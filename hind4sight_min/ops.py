@@ -83,62 +83,61 @@ def nearest_squared_distances(queries, references, valid, free=None):
 def bilinear_sample(images, positions):
     """Image values at positions between pixels. Paper: Eq. (3), after spatial transformers.
 
-    images (B, H, W, C) float; positions (B, N, 2) px, (x right, y down), pixel centres at whole numbers
-    -> (B, N, C). Outside the picture it is the nearest border pixel (with gradient 0 to the position).
+    images (B, H, W, C) float; positions (B, h, w, 2) px, (x right, y down), pixel centres at whole numbers
+    -> (B, h, w, C). Outside the picture it is the nearest border pixel (with gradient 0 to the position).
     cv2.remap does it; OpenCV 4 rounds positions to 1/32 px, OpenCV 5 only for float64 images.
     Raises ValueError for other shapes or positions that are not finite (OpenCV would silently read 0).
     """
-    if images.ndim != 4 or positions.ndim != 3 or positions.shape[::2] != (len(images), 2) or not positions.size:
-        raise ValueError("images, positions: expected (B, H, W, C) and (B, N, 2) with N >= 1, "
+    if images.ndim != 4 or positions.ndim != 4 or positions.shape[::3] != (len(images), 2) or not positions.size:
+        raise ValueError("images, positions: expected (B, H, W, C) and (B, h, w, 2) with h, w >= 1, "
                          f"got {images.shape}, {positions.shape}")
     if not np.isfinite(positions).all():
         raise ValueError("positions: expected finite pixels, got NaN or infinity")
-    batch, height, width, channels = images.shape
-    count = positions.shape[1]
-    last = np.array([width - 1, height - 1], positions.dtype)
-    maps = np.clip(positions, 0, last).astype(np.float32)
-    # remap wants a picture of positions, at most 32767 a side: fold the list into rows of 1024.
-    maps = np.pad(maps, ((0, 0), (0, -count % 1024), (0, 0))).reshape(batch, -1, 1024, 2)
-    sampled = [cv2.remap(image, xy, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-               for image, xy in zip(images, maps)]
-    return np.stack(sampled).reshape(batch, -1, channels)[:, :count]
+    x, y = _inside(images, positions)
+    return np.stack([_remap(*each) for each in zip(images, x, y)])
 
 
-def _corners(images, positions):
-    """Flat indices of the four pixels around each position, (4, B, N), and the fractions (B, N, 1) in the cell."""
-    batch, height, width, _ = images.shape
-    x = np.clip(positions[..., 0], 0, width - 1)
-    y = np.clip(positions[..., 1], 0, height - 1)
-    x0, y0 = np.minimum(x.astype(int), max(width - 2, 0)), np.minimum(y.astype(int), max(height - 2, 0))
-    first = (np.arange(batch)[:, None] * height + y0) * width + x0
-    right, down = (1 if width > 1 else 0), (width if height > 1 else 0)
-    a, b = ((v - v0).astype(images.dtype)[..., None] for v, v0 in ((x, x0), (y, y0)))
-    return np.stack([first, first + right, first + down, first + right + down]), a, b
+def _inside(images, positions):
+    """x and y of the positions moved into the picture, (B, h, w) float32 each."""
+    return (np.clip(positions[..., axis], 0, images.shape[2 - axis] - 1).astype(np.float32) for axis in (0, 1))
+
+
+def _remap(image, x, y):
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(x.shape + image.shape[2:])  # OpenCV drops the axis of a single channel
 
 
 def _bilinear_position_vjp(ans, images, positions):
-    height, width, channels = images.shape[1:]
-    corners, a, b = _corners(images, positions)
-    i00, i10, i01, i11 = images.reshape(-1, channels)[corners]
-    along_x = (1 - b) * (i10 - i00) + b * (i11 - i01)
-    along_y = (1 - a) * (i01 - i00) + a * (i11 - i10)
-    inside = (positions >= 0) & (positions <= [width - 1, height - 1])
-
+    """Within a cell of four pixels the slope along x is the difference of its columns, interpolated along y alone."""
     def vjp(g):
-        pull = np.stack([np.sum(g * along_x, axis=-1), np.sum(g * along_y, axis=-1)], axis=-1)
-        return (pull * inside).astype(positions.dtype)
+        pull, ones = np.zeros_like(positions), np.ones(images.shape[3], g.dtype)
+        for i, maps in enumerate(zip(*_inside(images, positions))):
+            for axis, size in enumerate(images.shape[2:0:-1]):
+                if size > 1:
+                    cell = list(maps)
+                    cell[axis] = np.minimum(np.floor(maps[axis]), size - 2)
+                    slope = _remap(np.diff(images[i], axis=1 - axis), *cell)
+                    slope *= g[i]
+                    along = positions[i, ..., axis]
+                    np.multiply(slope @ ones, (along >= 0) & (along <= size - 1), out=pull[i, ..., axis])
+        return pull
     return vjp
 
 
 def _bilinear_image_vjp(ans, images, positions):
-    corners, a, b = _corners(images, positions)
-    weights = ((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b)
+    """Every position gives to the four pixels around it, by their shares."""
+    batch, height, width, channels = images.shape
+    x, y = _inside(images, positions)
 
     def vjp(g):
-        result = np.zeros((images.size // images.shape[3], images.shape[3]), images.dtype)
-        for corner, weight in zip(corners, weights):
-            for c in range(images.shape[3]):
-                result[:, c] += np.bincount(corner.ravel(), (g * weight)[..., c].ravel(), len(result))
+        result = np.zeros((batch * height * width, channels), images.dtype)
+        for right in (0, 1):
+            for below in (0, 1):
+                column, row = np.minimum(np.floor(x) + right, width - 1), np.minimum(np.floor(y) + below, height - 1)
+                share = (x % 1 if right else 1 - x % 1) * (y % 1 if below else 1 - y % 1)
+                pixel = ((np.arange(batch)[:, None, None] * height + row) * width + column).astype(int).ravel()
+                for c in range(channels):
+                    result[:, c] += np.bincount(pixel, (g[..., c] * share).ravel(), len(result))
         return result.reshape(images.shape)
     return vjp
 
