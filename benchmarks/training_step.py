@@ -2,21 +2,24 @@
 
     python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
 
-Every contender is a process of its own, which makes the same steps on the same pokes: batch, forward, losses,
-backward, Adam. They take turns, so that a machine whose speed drifts slows all of them, and ratios are taken within a
-round. BLAS has one thread in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer,
-eager and compiled, and the fastest median counts; what starts off three times slower than the fastest is left out.
-Memory is the peak resident size, worker processes added up.
+Every contender makes the same steps on the same pokes: batch, forward, losses, backward, Adam. BLAS has one thread in
+our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
+fastest median counts. Also the floor: how long the bare matrix products of the network and the bare KD-trees of the
+Chamfer distance take, which no implementation can do without (ours avoids searches whose result is known). Some ten
+minutes on two cores.
 """
 import argparse
-import resource
 import statistics
-import subprocess
-import sys
 import time
 from contextlib import contextmanager
 
-from hind4sight_min import training
+import numpy as np
+from autograd import grad
+from autograd.tracer import isbox
+from race import fastest, race, ratios, report, serve
+from scipy.spatial import cKDTree
+
+from hind4sight_min import geometry, losses, networks, training
 from hind4sight_min.__main__ import data_small, write_json
 from hind4sight_min.interactions import load_interactions
 
@@ -26,7 +29,7 @@ TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree"
               for mode in ("eager", "compiled") for threads in (1, 2))
 
 
-# --- the contenders: a block with a function that makes one step ------------------------------------------------
+# --- the contenders: a context with a function that makes one step ---------------------------------------------
 
 @contextmanager
 def ours(batch, jobs):
@@ -63,92 +66,120 @@ def twin(batch, chamfer, mode, threads):
 
 
 def work(name, batch):
-    """The process of one contender: a number of steps per line of input, the seconds they took per line of output."""
     if name in OURS:
         jobs = 1 + OURS.index(name)
-        contender = ours(batch, jobs)
-    else:
-        _, chamfer, mode, threads, _ = name.split("_")
-        jobs, contender = 1, twin(batch, chamfer, mode, int(threads))
-    with contender as step:
-        for line in sys.stdin:
-            start = time.perf_counter()
-            for _ in range(int(line)):
-                step()
-            print(time.perf_counter() - start, flush=True)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if jobs > 1:
-        peak += jobs * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    print(peak / 1024, flush=True)
+        return serve(ours(batch, jobs), workers=jobs - 1)
+    _, chamfer, mode, threads, _ = name.split("_")
+    return serve(twin(batch, chamfer, mode, int(threads)))
 
 
-# --- the comparison -----------------------------------------------------------------------------------------------
+# --- the floor ---------------------------------------------------------------------------------------------------
 
-class Contender:
-    def __init__(self, name, batch):
-        self.process = subprocess.Popen([sys.executable, __file__, "--contender", name, "--batch", str(batch)],
-                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+def products_of(network, vector):
+    """All matrix products of a network's layers, forward and back, as a list of pairs of matrices."""
+    shapes = []
 
-    def seconds_per_step(self, count):
-        self.process.stdin.write(f"{count}\n")
-        self.process.stdin.flush()
-        return float(self.process.stdout.readline()) / count
+    def recorded(x, weights, bias, **options):
+        shapes.append((x.shape, weights.shape, isbox(x)))
+        return dense(x, weights, bias, **options)
+    dense, networks.dense = networks.dense, recorded
+    try:
+        grad(network)(vector)
+    finally:
+        networks.dense = dense
+    rng, pairs = np.random.default_rng(0), []
+    for shape, (inputs, outputs), traced in shapes:
+        x, w, g = (rng.standard_normal(size).astype(np.float32)
+                   for size in (shape, (inputs, outputs), shape[:-1] + (outputs,)))
+        pairs.append((x, w))
+        pairs.append((x.reshape(-1, inputs).T, g.reshape(-1, outputs)))
+        if traced:  # something below it learns
+            pairs.append((g, w.T))
+    return pairs
 
-    def stop(self):
-        """Ends the process -> its peak memory in MB."""
-        self.process.stdin.close()
-        return float(self.process.stdout.readlines()[-1])
+
+def seconds_of(call):
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
 
 
-def compare(names, batch, rounds, count):
-    """Every contender in turn, round after round -> {name: seconds per step of each round}, {name: peak MB}."""
-    contenders, first = {}, {}
-    for name in names:
-        contender = Contender(name, batch)
-        try:
-            contender.seconds_per_step(2)  # warm up; compile
-            first[name] = contender.seconds_per_step(1)
-        except ValueError:
-            print(f"{name}: does not run here", flush=True)
-            continue
-        if first[name] > 3 * min(first.values()):
-            print(f"{name}: {first[name]:.1f} s a step, out of the race", flush=True)
-            contender.stop()
-            continue
-        contenders[name] = contender
-    seconds = {name: [] for name in contenders}
-    for _ in range(rounds):
-        for name, contender in contenders.items():
-            seconds[name].append(contender.seconds_per_step(count))
-    return seconds, {name: contender.stop() for name, contender in contenders.items()}
+def floors(rounds, batch_size=8):
+    """The network and the Chamfer distance of one gradient, against the bare products and trees, on one thread."""
+    data = load_interactions(DATA)
+    run = training.start_run(training.Recipe(), data)
+    rng = np.random.default_rng(0)
+    run.vector = run.vector + 0.02 * rng.standard_normal(run.vector.shape).astype(np.float32)
+    batch, sizes = training.make_batch(data, np.arange(batch_size)), run.recipe.sizes
+
+    def network(vector):
+        params = training.unflatten(vector, run.layout)
+        prediction, _, heatmaps = training.run_model(params, sizes, batch, data.camera)
+        seen = networks.state_embedding(networks.encode(params, batch.next_points), batch.next_valid)
+        return sum((value * value).sum() for value in (prediction.points, prediction.embedding, seen, *heatmaps))
+
+    pairs = products_of(network, run.vector)
+    trained = training.load_run(data_small() / "checkpoint.npz")
+    predicted = training.run_model(trained.params, trained.recipe.sizes, batch, data.camera)[0].points
+
+    def bare_products():
+        for a, b in pairs:
+            np.matmul(a, b)
+
+    def chamfer(predicted, spare):
+        free = (geometry.free_radius(batch.points, getattr(predicted, "_value", predicted),
+                                     geometry.ray_spacing(batch.points, data.camera)),
+                geometry.ray_spacing(batch.next_points, data.camera)) if spare else ()
+        maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared, *free)
+        return losses.chamfer_loss(*maps).sum()
+
+    def bare_trees():
+        for p, q, valid, next_valid in zip(predicted, batch.next_points, batch.shared, batch.next_shared):
+            cKDTree(q[next_valid], compact_nodes=False, balanced_tree=False).query(p)
+            cKDTree(p[valid], compact_nodes=False, balanced_tree=False).query(q)
+
+    figures = {}
+    for name, call, bare in (("network_over_matmul_floor", lambda: grad(network)(run.vector), bare_products),
+                             ("chamfer_over_kdtree_floor", lambda: grad(chamfer)(predicted, False), bare_trees),
+                             ("chamfer_in_step_over_kdtree_floor", lambda: grad(chamfer)(predicted, True), bare_trees)):
+        call(), bare()
+        each = [(min(seconds_of(call) for _ in range(5)), min(seconds_of(bare) for _ in range(5)))
+                for _ in range(rounds)]
+        values = [a / b for a, b in each]
+        figures.update({name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values),
+                        f"{name}_bare_ms": 1e3 * statistics.median(b for _, b in each) / batch_size})
+        print(f"{name}: {statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f}); the floor is "
+              f"{figures[f'{name}_bare_ms']:.2f} ms per interaction", flush=True)
+    return figures
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--steps", type=int, default=8, help="of each contender per round")
-    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--batch", type=int, nargs="+", default=[16, 4, 64], help="the first counts, the default one")
     parser.add_argument("--only", nargs="+", choices=OURS + TWINS, default=OURS + TWINS)
     parser.add_argument("--contender", choices=OURS + TWINS, help=argparse.SUPPRESS)
     parser.add_argument("--json")
     args = parser.parse_args()
     if args.contender:
-        return work(args.contender, args.batch)
-    seconds, memory = compare(args.only, args.batch, args.rounds, args.steps)
-    for name, values in seconds.items():
-        print(f"{name:<32} {1e3 * statistics.median(values):7.0f} ms a step ({1e3 * min(values):.0f} to "
-              f"{1e3 * max(values):.0f}), {memory[name]:.0f} MB")
-    figures = {f"{name}_ms": 1e3 * statistics.median(values) for name, values in seconds.items()}
-    figures.update({f"{name}_mb": value for name, value in memory.items()})
-    best_of = {kind: min((name for name in names if name in seconds), key=lambda name: statistics.median(seconds[name]))
-               for kind, names in (("ours", OURS), ("torch", TWINS)) if any(name in seconds for name in names)}
-    if len(best_of) == 2:
-        ratios = [twin / own for own, twin in zip(seconds[best_of["ours"]], seconds[best_of["torch"]])]
-        share = memory[best_of["ours"]] / memory[best_of["torch"]]
-        figures.update(train_step_speedup_vs_torch=statistics.median(ratios), train_step_memory_vs_torch=share,
-                       train_step_speedup_vs_torch_min=min(ratios), train_step_speedup_vs_torch_max=max(ratios))
-        print(f"{best_of['ours']} is {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) times as "
-              f"fast as {best_of['torch']}, with {share:.2f} of its memory")
+        return work(args.contender, args.batch[0])
+    figures = floors(args.rounds)
+    for batch in args.batch:
+        print(f"a step of {batch} interactions")
+        times, memory = race(__file__, args.only, ["--batch", batch], args.rounds, seconds=1.0)
+        report(times, memory)
+        figures.update({f"{name}_batch_{batch}_ms": 1e3 * statistics.median(values) for name, values in times.items()})
+        figures.update({f"{name}_batch_{batch}_mb": value for name, value in memory.items()})
+        own, other = (fastest(times, names) for names in (OURS, TWINS))
+        speedup, least, most = ratios(times, other, own)
+        share = memory[own] / memory[other]
+        print(f"{own} is {speedup:.2f} ({least:.2f} to {most:.2f}) times as fast as {other}, with {share:.2f} of its "
+              "memory", flush=True)
+        suffix = "" if batch == args.batch[0] else f"_batch_{batch}"
+        figures.update({f"train_step_speedup_vs_torch{suffix}": speedup,
+                        f"train_step_speedup_vs_torch{suffix}_min": least,
+                        f"train_step_speedup_vs_torch{suffix}_max": most,
+                        f"train_step_memory_vs_torch{suffix}": share})
     write_json(args.json, figures)
 
 

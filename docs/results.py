@@ -52,6 +52,15 @@ HEADLINES = {
                                     "training step: speed against PyTorch's best", "{:.2f}", ">= 1.5"),
     "train_step_memory_vs_torch": ("training_step", "train_step_memory_vs_torch",
                                    "training step: peak memory against PyTorch's best", "{:.2f}", "<= 0.5"),
+    "network_over_matmul_floor": ("training_step", "network_over_matmul_floor",
+                                  "network, forward and back, against its bare matrix products", "{:.1f}", "<= 2.5"),
+    "chamfer_over_kdtree_floor": ("training_step", "chamfer_over_kdtree_floor",
+                                  "Chamfer, value and gradient, against bare KD-trees", "{:.2f}", "<= 1.5"),
+    "chamfer_speedup_vs_torch_10k": ("operations", "chamfer_speedup_vs_torch_10k",
+                                     "Chamfer of 10,000 points: speed against brute-force PyTorch", "{:.0f}", ">= 30"),
+    "warp_speedup_vs_grid_sample_min": ("operations", "warp_speedup_vs_grid_sample_min",
+                                        "warping: speed against grid_sample, at its worst size", "{:.2f}", ">= 1"),
+    "import_seconds": ("startup", "import_seconds", "import, seconds", "{:.2f}", "< 1"),
 }
 
 

@@ -11,7 +11,7 @@ import numpy as onp
 from autograd.tracer import getval
 
 from .geometry import project, so3_exp, transform_layer
-from .ops import dense, pool, softmax, take
+from .ops import dense, pool, softmax, take, weighted_means
 
 
 @dataclass(frozen=True)
@@ -243,9 +243,7 @@ def _motions(params, h, masks, seen, local, valid):
     T = c - R c + t, all in the poke frame.
     """
     moving = take(masks, (..., slice(1, None))) * valid[..., None]
-    total = np.matmul(onp.ones((1, h.shape[1]), local.dtype), moving)  # a sum; NumPy's own is slow along this axis
-    share = np.swapaxes(moving / (total + 1e-3), 1, 2)  # (B, K-1, N), sum to 1
-    pooled, centroids = np.matmul(share, h), np.matmul(share, local)  # (B, K-1, C), (B, K-1, 3)
+    pooled, centroids = weighted_means(h, moving), weighted_means(local, moving)  # (B, K-1, C), (B, K-1, 3)
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
     x = layer(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2))

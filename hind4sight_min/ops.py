@@ -71,7 +71,8 @@ def nearest_squared_distances(queries, references, valid, free=None):
         rows = np.flatnonzero(valid[i])
         # An unbalanced tree is built twice as fast, and queried as fast on clouds like ours.
         tree = cKDTree(r[i, rows], compact_nodes=False, balanced_tree=False)
-        indices[i, search[i]] = rows[tree.query(q[i, search[i]])[1]] + i * r.shape[1]
+        threads = -1 if q.shape[1] > 4096 else 1  # starting them does not pay for a window
+        indices[i, search[i]] = rows[tree.query(q[i, search[i]], workers=threads)[1]] + i * r.shape[1]
     flat = squared_distances(anp.reshape(queries, (-1, q.shape[2])), anp.reshape(references, (-1, r.shape[2])),
                              indices.ravel())
     return anp.reshape(flat, q.shape[:2])
@@ -256,6 +257,36 @@ def _pool_vjp(ans, x, valid, weights):
 
 
 defvjp(pool, _pool_vjp, None, None)
+
+
+@primitive
+def weighted_means(x, weights, floor=1e-3):
+    """K weighted means of a cloud: sum_n w_nk x_n / (sum_n w_nk + floor).  x (B, N, C), weights (B, N, K) -> (B, K, C).
+
+    The floor keeps the mean under a mask that covers nothing finite, at 0.
+    """
+    return np.matmul(_shares(weights, floor)[0], x)
+
+
+def _shares(weights, floor):
+    """(B, K, N) and (B, 1, K): the weights over their sum, and the sum; as a product, np.sum is slow along this axis."""
+    total = np.matmul(np.ones((1, weights.shape[1]), weights.dtype), weights) + weights.dtype.type(floor)
+    return np.swapaxes(weights / total, 1, 2), total
+
+
+def _weighted_means_vjp(argnums, ans, args, kwargs):
+    x, weights = args
+    shares, total = _shares(weights, kwargs.get("floor", 1e-3))
+
+    def vjp(g):
+        gradients = (lambda: np.matmul(np.swapaxes(shares, 1, 2), g),
+                     # a heavier point pulls the mean from where it was towards itself
+                     lambda: (np.matmul(x, np.swapaxes(g, 1, 2)) - np.sum(ans * g, axis=2)[:, None]) / total)
+        return [gradients[argnum]() for argnum in argnums]
+    return vjp
+
+
+defvjp_argnums(weighted_means, _weighted_means_vjp)
 
 
 @primitive

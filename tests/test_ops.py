@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from hind4sight_min import ops
 from hind4sight_min.ops import (dense, nearest_squared_distances, pool, softmax, squared_distances,
-                                take, take_block, total_variation)
+                                take, take_block, total_variation, weighted_means)
 
 CV2_MAJOR = int(cv2.__version__.split(".")[0])
 
@@ -411,6 +411,22 @@ def test_the_maximum_of_zeros_is_not_that_of_an_invalid_point():
     assert not pulled_back(pool, 0, 1.0, x, valid, weights)[0, 0].any()
 
 
+def test_weighted_means_and_their_gradients_match_autograd_of_the_plain_formula():
+    rng = np.random.default_rng(23)
+    x, weights, g = rng.normal(size=(2, 6, 4)), rng.random((2, 6, 3)), rng.normal(size=(2, 3, 4))
+
+    def plain(x, weights):
+        total = anp.sum(weights, axis=1) + 1e-3
+        return anp.einsum("bnk,bnc->bkc", weights, x) / total[..., None]
+    np.testing.assert_allclose(weighted_means(x, weights), plain(x, weights), rtol=1e-12)
+    for argnum in (0, 1):
+        found = pulled_back(weighted_means, argnum, g, x, weights)
+        np.testing.assert_allclose(found, pulled_back(plain, argnum, g, x, weights), rtol=0, atol=1e-12)
+        assert np.abs(found).min() > 1e-5
+    check_grads(weighted_means, (0, 1), modes=["rev"], order=1)(x, weights)
+    np.testing.assert_array_equal(weighted_means(x, 0 * weights), np.zeros((2, 3, 4)))  # under an empty mask
+
+
 def test_softmax_and_its_gradient_match_scipy_and_finite_differences():
     rng = np.random.default_rng(15)
     logits, g = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 4))
@@ -483,6 +499,8 @@ def dtype_cases():
     pooling = rng.random((2, 2, 5))
     yield pool, 0, (np.abs(x), np.ones((2, 5), bool), pooling)
     yield pool, 0, (np.abs(x), np.array([[True, False, True, True, False]] * 2), pooling)
+    for argnum in range(2):
+        yield weighted_means, argnum, (x, rng.random((2, 5, 3)))
     yield softmax, 0, (x,)
     yield total_variation, 0, (images, rng.random((2, 4, 4)), rng.random((2, 3, 5)))
 

@@ -1,0 +1,221 @@
+"""Chamfer distance and bilinear warping, value and gradient, against what one would use instead, at several sizes.
+
+    python benchmarks/operations.py --json docs/results/operations.json --figure docs/speed.png
+                                                                            (needs the extra "bench")
+
+Chamfer: our KD-trees against brute force in PyTorch (one and two threads) and point-cloud-utils (its nearest neighbours,
+the gradient in NumPy). Warping: our cv2.remap against PyTorch's grid_sample (one and two threads) and SciPy's
+map_coordinates. Ours uses the threads OpenCV takes by itself, and one for all else. The figure shows these and, where
+docs/results/training_step.json is there, the training step. Some fifteen minutes on two cores.
+"""
+import argparse
+import json
+import statistics
+from contextlib import contextmanager
+from pathlib import Path
+
+import autograd.numpy as anp
+import cv2
+import numpy as np
+from autograd import grad, value_and_grad
+from matplotlib.figure import Figure
+from race import fastest, race, ratios, report, serve
+
+from hind4sight_min import losses
+from hind4sight_min.__main__ import write_json
+from hind4sight_min.interactions import whole_file
+
+CHAMFER = ("ours", "torch_1_threads", "torch_2_threads", "point_cloud_utils")
+WARP = ("ours", "torch_1_threads", "torch_2_threads", "scipy")
+POINTS = (500, 2000, 10000, 30000, 100000)
+PICTURES = ((48, 64), (96, 128), (240, 320), (480, 640))
+LARGEST_BRUTE = 30000  # points: beyond it a matrix of all pairs takes minutes
+
+
+# --- Chamfer ---------------------------------------------------------------------------------------------------
+
+def clouds(count):
+    """A bumpy surface as a depth picture shows it, row by row, before and after it moved by 5 mm of noise: (count, 3)."""
+    rng = np.random.default_rng(0)
+    columns = int(np.ceil(np.sqrt(count)))
+    xy = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, columns)] * 2), axis=-1).reshape(-1, 2)[:count]
+    points = np.column_stack([xy, 0.03 * np.sin(20 * xy[:, 0]) * np.sin(25 * xy[:, 1])])
+    return (points.astype(np.float32), (points + 0.005 * rng.standard_normal((count, 3))).astype(np.float32))
+
+
+@contextmanager
+def chamfer(name, count):
+    """Chamfer distance of two clouds and its gradient to the first."""
+    predicted, observed = clouds(count)
+    if name == "ours":
+        valid = np.ones((1, count), bool)
+
+        def loss(predicted):
+            return anp.sum(losses.chamfer_loss(*losses.distance_maps(predicted[None], observed[None], valid, valid)))
+        yield lambda: value_and_grad(loss)(predicted)
+    elif name == "point_cloud_utils":
+        import point_cloud_utils as pcu
+
+        def call():
+            _, to = pcu.k_nearest_neighbors(predicted, observed, 1)
+            _, back = pcu.k_nearest_neighbors(observed, predicted, 1)
+            there, here = predicted - observed[to], predicted[back] - observed
+            gradient = 2 * there
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(back, 2 * here[:, axis], count)
+            return (there * there).sum() + (here * here).sum(), gradient
+        yield call
+    else:
+        import torch
+        torch.set_num_threads(int(name.split("_")[1]))
+        p, q = (torch.from_numpy(points) for points in (predicted, observed))
+
+        def call():
+            variable = p.clone().requires_grad_()
+            with torch.no_grad():
+                distances = torch.cdist(variable, q)
+                to, back = distances.argmin(dim=1), distances.argmin(dim=0)
+            value = ((variable - q[to]) ** 2).sum() + ((variable[back] - q) ** 2).sum()
+            value.backward()
+            return value.item(), variable.grad
+        yield call
+
+
+# --- warping ---------------------------------------------------------------------------------------------------
+
+@contextmanager
+def warp(name, height, width):
+    """A picture pulled back along a flow, and the gradient of a weighted sum of it to the flow."""
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.random((height // 8, width // 8, 3)).astype(np.float32), (width, height))
+    flow = (2 * rng.standard_normal((height, width, 2))).astype(np.float32)
+    g = rng.standard_normal(image.shape).astype(np.float32)
+    if name == "ours":
+        def loss(flow):
+            return anp.sum(losses.warp_backward(image[None], flow)[0] * g)
+        yield lambda: grad(loss)(flow[None])
+    elif name == "scipy":
+        from scipy.ndimage import map_coordinates
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+
+        def call():  # the picture and, for the gradient, the differences between its pixels
+            pulled = np.zeros_like(flow)
+            where = [np.clip(y + flow[..., 1], 0, height - 1), np.clip(x + flow[..., 0], 0, width - 1)]
+            for c in range(3):
+                map_coordinates(image[..., c], where, order=1, mode="nearest")
+                for axis in (0, 1):
+                    cell = list(where)
+                    cell[axis] = np.minimum(np.floor(where[axis]), image.shape[axis] - 2)
+                    slope = map_coordinates(np.diff(image[..., c], axis=axis), cell, order=1, mode="nearest")
+                    pulled[..., 1 - axis] += g[..., c] * slope
+            return pulled
+        yield call
+    else:
+        import torch
+        import torch.nn.functional as F
+        torch.set_num_threads(int(name.split("_")[1]))
+        picture, weights = (torch.from_numpy(value).permute(2, 0, 1)[None].contiguous() for value in (image, g))
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        pixels, last = torch.stack([u, v], dim=-1).float(), torch.tensor([width - 1.0, height - 1.0])
+
+        def call():
+            variable = torch.from_numpy(flow)[None].requires_grad_()
+            warped = F.grid_sample(picture, 2 * (pixels + variable) / last - 1, padding_mode="border",
+                                   align_corners=True)
+            (warped * weights).sum().backward()
+            return variable.grad
+        yield call
+
+
+# --- the comparison -------------------------------------------------------------------------------------------
+
+def measure(what, names, sizes, rounds, figures):
+    """Race all contenders at all sizes -> {name: [median seconds per size]}, and fill the flat dict of figures."""
+    medians = {name: [] for name in names}
+    for size in sizes:
+        label = "x".join(map(str, size))
+        print(f"{what}, {label}", flush=True)
+        entered = [name for name in names
+                   if what == "warp" or not name.startswith("torch") or size[0] <= LARGEST_BRUTE]
+        times, memory = race(__file__, entered, [what, *size], rounds, hopeless=200)
+        report(times, memory)
+        for name in names:
+            medians[name].append(statistics.median(times[name]) if name in times else float("nan"))
+        for name, values in times.items():
+            figures[f"{what}_{label}_{name}_ms"] = 1e3 * statistics.median(values)
+            figures[f"{what}_{label}_{name}_mb"] = memory[name]
+        for kind in {name.split("_")[0] for name in times} - {"ours"}:
+            other = fastest(times, [name for name in times if name.startswith(kind)])
+            if len(times[other]) == len(times["ours"]):
+                speedup, least, most = ratios(times, other, "ours")
+            else:  # hopeless: measured once
+                speedup = times[other][0] / statistics.median(times["ours"])
+                least, most = (times[other][0] / extreme(times["ours"]) for extreme in (max, min))
+            figures.update({f"{what}_{label}_speedup_vs_{kind}": speedup,
+                            f"{what}_{label}_speedup_vs_{kind}_min": least,
+                            f"{what}_{label}_speedup_vs_{kind}_max": most})
+            print(f"  ours is {speedup:.2f} ({least:.2f} to {most:.2f}) times as fast as {other}", flush=True)
+    return medians
+
+
+def draw(path, chamfer_seconds, warp_seconds, step_file):
+    step = json.loads(step_file.read_text())["figures"] if step_file.exists() else {}
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3)
+    styles = {"ours": ("#0072B2", "o"), "ours_1": ("#56B4E9", "o"), "torch_1_threads": ("#E69F00", "s"),
+              "torch_2_threads": ("#D55E00", "s"), "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
+    for axis, seconds, sizes, title, unit in (
+            (axes[0], chamfer_seconds, POINTS, "Chamfer distance: grows like N log N", "points"),
+            (axes[1], warp_seconds, [h * w for h, w in PICTURES], "Warping: grid_sample is ahead", "pixels")):
+        for name, values in seconds.items():
+            colour, marker = styles[name]
+            axis.loglog(sizes, 1e3 * np.array(values), color=colour, marker=marker, label=name.replace("_", " "))
+        axis.set(title=title, xlabel=unit, ylabel="ms, value and gradient")
+        axis.legend(fontsize=7)
+    n = np.array(POINTS, float)
+    axes[0].loglog(n, 1e3 * chamfer_seconds["ours"][0] * n * np.log(n) / (n[0] * np.log(n[0])), ":", color="grey")
+    batches = sorted({int(name.split("_batch_")[1].split("_")[0]) for name in step if name.endswith("_ms")
+                      and "_batch_" in name})
+    for name, colour, marker, label in (("ours_1_process", "#56B4E9", "o", "ours, 1 process"),
+                                        ("ours_2_processes", "#0072B2", "o", "ours, 2 processes"),
+                                        ("torch_tree_eager_1_threads", "#E69F00", "s", "torch, 1 thread"),
+                                        ("torch_tree_eager_2_threads", "#D55E00", "s", "torch, 2 threads")):
+        values = [step.get(f"{name}_batch_{batch}_ms", float("nan")) for batch in batches]
+        axes[2].loglog(batches, values, color=colour, marker=marker, label=label)
+    axes[2].set(title="A training step of the full model", xlabel="interactions per step", ylabel="ms")
+    axes[2].set_xticks(batches, labels=batches)
+    axes[2].minorticks_off()
+    axes[2].legend(fontsize=7)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json")
+    parser.add_argument("--figure")
+    parser.add_argument("--contender", help=argparse.SUPPRESS)
+    parser.add_argument("task", nargs="*", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.contender:
+        what, *size = args.task
+        return serve({"chamfer": chamfer, "warp": warp}[what](args.contender, *map(int, size)))
+    figures = {}
+    chamfer_seconds = measure("chamfer", CHAMFER, [(count,) for count in POINTS], args.rounds, figures)
+    warp_seconds = measure("warp", WARP, PICTURES, args.rounds, figures)
+    cost = {count: seconds / (count * np.log(count)) for count, seconds in zip(POINTS, chamfer_seconds["ours"])}
+    figures["chamfer_growth_over_nlogn_10k_to_100k"] = cost[100000] / cost[10000]
+    figures["chamfer_speedup_vs_torch_10k"] = figures["chamfer_10000_speedup_vs_torch"]
+    figures["warp_speedup_vs_grid_sample_min"] = min(figures[f"warp_{h}x{w}_speedup_vs_torch"] for h, w in PICTURES)
+    for name in ("chamfer_growth_over_nlogn_10k_to_100k", "chamfer_speedup_vs_torch_10k",
+                 "warp_speedup_vs_grid_sample_min"):
+        print(f"{name}: {figures[name]:.2f}")
+    write_json(args.json, figures)
+    if args.figure:
+        draw(Path(args.figure), chamfer_seconds, warp_seconds,
+             Path(__file__).resolve().parent.parent / "docs" / "results" / "training_step.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""What the benchmarks share: contenders that run in processes of their own and take turns.
+
+A machine whose speed drifts slows all of them, ratios are taken within a round, and each has a peak memory of its own.
+"""
+import resource
+import statistics
+import subprocess
+import sys
+import time
+
+
+def serve(contender, workers=0):
+    """The process of a contender, a context that gives the function to call.
+
+    Per line of input, a number of calls, one line of output, the seconds they took; the last line is the peak resident
+    memory in MB, that of its worker processes added (which have ended by then).
+    """
+    with contender as call:
+        for line in sys.stdin:
+            start = time.perf_counter()
+            for _ in range(int(line)):
+                call()
+            print(time.perf_counter() - start, flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if workers:
+        peak += workers * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    print(peak / 1024, flush=True)
+
+
+class Contender:
+    def __init__(self, script, arguments):
+        self.process = subprocess.Popen([sys.executable, script, *map(str, arguments)], stdin=subprocess.PIPE,
+                                        stdout=subprocess.PIPE, text=True)
+
+    def seconds(self, calls):
+        """Per call."""
+        self.process.stdin.write(f"{calls}\n")
+        self.process.stdin.flush()
+        return float(self.process.stdout.readline()) / calls
+
+    def stop(self):
+        """Ends the process -> its peak memory in MB."""
+        self.process.stdin.close()
+        return float(self.process.stdout.readlines()[-1])
+
+
+def race(script, names, arguments, rounds, seconds=0.5, hopeless=3.0):
+    """Every contender in turn, round after round -> {name: seconds per call of each round}, {name: peak MB}.
+
+    A turn has as many calls as take the first-comer some `seconds`. What does not run here is left out, and what starts
+    off `hopeless` times slower than the fastest is measured once and no more.
+    """
+    running, first, memory = {}, {}, {}
+    for name in names:
+        contender = Contender(script, ["--contender", name, *arguments])
+        try:
+            contender.seconds(2)  # warm up; compile
+            first[name] = contender.seconds(1)
+        except ValueError:
+            print(f"{name}: does not run here", flush=True)
+            continue
+        running[name] = contender
+    times = {name: [first[name]] for name in running}
+    for name in [name for name in running if first[name] > hopeless * min(first.values())]:
+        memory[name] = running.pop(name).stop()
+    calls = max(1, round(seconds / min(first.values())))
+    for name in running:
+        times[name] = []
+    for _ in range(rounds):
+        for name, contender in running.items():
+            times[name].append(contender.seconds(calls))
+    memory.update({name: contender.stop() for name, contender in running.items()})
+    return times, memory
+
+
+def fastest(times, names):
+    """The contender with the smallest median among `names`."""
+    return min((name for name in names if name in times), key=lambda name: statistics.median(times[name]))
+
+
+def ratios(times, slow, fast):
+    """How many times faster `fast` is than `slow`: median, least and most over the rounds."""
+    each = [a / b for a, b in zip(times[slow], times[fast])]
+    return statistics.median(each), min(each), max(each)
+
+
+def report(times, memory):
+    for name, values in times.items():
+        print(f"  {name:<32} {1e3 * statistics.median(values):9.2f} ms ({1e3 * min(values):.2f} to "
+              f"{1e3 * max(values):.2f}, {len(values)} rounds), {memory[name]:.0f} MB", flush=True)
