@@ -204,7 +204,7 @@ def run_show(args):
 
 
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
-DEMO_RECIPE = training.Recipe(steps=600)
+DEMO_RECIPE = training.Recipe(steps=1000)
 
 
 def run_demo(args):
