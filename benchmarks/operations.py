@@ -137,7 +137,7 @@ def measure(what, names, sizes, rounds, figures):
         print(f"{what}, {label}", flush=True)
         entered = [name for name in names
                    if what == "warp" or not name.startswith("torch") or size[0] <= LARGEST_BRUTE]
-        times, memory = race(__file__, entered, [what, *size], rounds, hopeless=200)
+        times, memory = race(__file__, entered, [what, *size], rounds)
         report(times, memory)
         for name in names:
             medians[name].append(statistics.median(times[name]) if name in times else float("nan"))
@@ -148,7 +148,7 @@ def measure(what, names, sizes, rounds, figures):
             other = fastest(times, [name for name in times if name.startswith(kind)])
             if len(times[other]) == len(times["ours"]):
                 speedup, least, most = ratios(times, other, "ours")
-            else:  # hopeless: measured once
+            else:  # measured once
                 speedup = times[other][0] / statistics.median(times["ours"])
                 least, most = (times[other][0] / extreme(times["ours"]) for extreme in (max, min))
             figures.update({f"{what}_{label}_speedup_vs_{kind}": speedup,

@@ -44,11 +44,11 @@ class Contender:
         return float(self.process.stdout.readlines()[-1])
 
 
-def race(script, names, arguments, rounds, seconds=0.5, hopeless=3.0):
+def race(script, names, arguments, rounds, seconds=0.5, hopeless=1e9, patience=5.0):
     """Every contender in turn, round after round -> {name: seconds per call of each round}, {name: peak MB}.
 
-    A turn has as many calls as take the first-comer some `seconds`. What does not run here is left out, and what starts
-    off `hopeless` times slower than the fastest is measured once and no more.
+    A turn has as many calls as take the fastest some `seconds`. What does not run here is left out; what starts off
+    `hopeless` times slower than the fastest, or takes longer than `patience` seconds, is measured once and no more.
     """
     running, first, memory = {}, {}, {}
     for name in names:
@@ -60,15 +60,15 @@ def race(script, names, arguments, rounds, seconds=0.5, hopeless=3.0):
             print(f"{name}: does not run here", flush=True)
             continue
         running[name] = contender
-    times = {name: [first[name]] for name in running}
-    for name in [name for name in running if first[name] > hopeless * min(first.values())]:
+    times = {name: [first[name]] for name in running}  # of the last warm-up call
+    for name in [name for name in running if first[name] > min(hopeless * min(first.values()), patience)]:
         memory[name] = running.pop(name).stop()
     calls = max(1, round(seconds / min(first.values())))
     for name in running:
         times[name] = []
     for _ in range(rounds):
         for name, contender in running.items():
-            times[name].append(contender.seconds(calls))
+            times[name].append(contender.seconds(1 if first[name] > seconds else calls))
     memory.update({name: contender.stop() for name, contender in running.items()})
     return times, memory
 

@@ -17,7 +17,8 @@ from hind4sight_min.losses import EDGE_SHARPNESS
 
 def tensors(batch):
     """A training.Batch as a dict of tensors."""
-    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in vars(batch).items()}
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in vars(batch).items()
+            if value is not None}
 
 
 # --- the network ----------------------------------------------------------------------------------------------

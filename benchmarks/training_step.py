@@ -166,7 +166,8 @@ def main():
     figures = floors(args.rounds)
     for batch in args.batch:
         print(f"a step of {batch} interactions")
-        times, memory = race(__file__, args.only, ["--batch", batch], args.rounds, seconds=1.0)
+        times, memory = race(__file__, args.only, ["--batch", batch], args.rounds, seconds=1.0,
+                             hopeless=3.0)
         report(times, memory)
         figures.update({f"{name}_batch_{batch}_ms": 1e3 * statistics.median(values) for name, values in times.items()})
         figures.update({f"{name}_batch_{batch}_mb": value for name, value in memory.items()})

@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, demo. `hind4sight COMMAND --help` says more."""
+"""The `hind4sight` command: collect, train, evaluate, show, demo, reproduce. `hind4sight COMMAND --help` says more."""
 import argparse
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import evaluation, simulator, training
+from . import evaluation, reproduce, simulator, training
 from .geometry import project
 from .interactions import load_interactions, load_truth, whole_file
 from .losses import distance_maps, warp_backward
@@ -203,6 +203,15 @@ def run_show(args):
     print(args.out)
 
 
+def run_reproduce(args):
+    scale = reproduce.QUICK if args.quick else reproduce.FULL
+    tables = list(reproduce.TABLES) if args.table == "all" else [args.table]
+    out = Path(args.out or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
+    figures = reproduce.reproduce(tables, out, scale, args.jobs, progress=progress_line("collect"))
+    print(reproduce.tables_text(tables, figures))
+    write_json(args.json or out / f"{args.table}.json", figures)
+
+
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
 DEMO_RECIPE = training.Recipe(steps=1000)
 
@@ -299,6 +308,14 @@ def build_parser():
             sub.add_argument("--out", default="interaction.png")
         else:
             sub.add_argument("--json", help="write the figures here too")
+
+    sub = command("reproduce", run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it "
+                  "can be stopped and started again (needs pybullet)")
+    sub.add_argument("table", choices=[*reproduce.TABLES, "all"])
+    sub.add_argument("--quick", action="store_true", help="the same tables from little data, in under ten minutes")
+    sub.add_argument("--out", help="folder of data and runs (runs/reproduce, runs/reproduce-quick)")
+    sub.add_argument("--jobs", type=int, default=os.cpu_count())
+    sub.add_argument("--json", help="write the figures here (otherwise to OUT/TABLE.json)")
 
     sub = command("demo", run_demo, "collect, train, evaluate and show, in under five minutes (needs pybullet)")
     sub.add_argument("--out", default="runs/demo")

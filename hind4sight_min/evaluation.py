@@ -4,10 +4,11 @@ This file reads the simulator's truth; training does not.
 """
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from .geometry import optical_flow
-from .interactions import cell_centres, true_scene_flow
+from .geometry import optical_flow, unproject
+from .interactions import cell_centres, points_and_validity, true_scene_flow
 from .networks import windows
 from .ops import softmax
 from .training import make_batch, run_model
@@ -15,14 +16,15 @@ from .training import make_batch, run_model
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
 
 
-def predict(run, interactions, rows):
+def predict(run, interactions, rows, depth_noise=0.0, seed=0):
     """The whole model on some rows, its windows pasted into the whole picture.
 
     -> (whole Batch, Prediction, optical flow (B, H, W, 2) px, start heat-maps, end heat-maps). Outside the windows all
-    is background and stays.
+    is background and stays. depth_noise: SD in m of the noise the model sees the depth with, drawn from `seed`.
     """
     camera = interactions.camera
-    batch, whole = make_batch(interactions, rows), make_batch(interactions, rows, whole=True)
+    batch, whole = (make_batch(interactions, rows, depth_noise=depth_noise, rng=np.random.default_rng([seed, rows[0]]),
+                               whole=whole) for whole in (False, True))
     prediction, flow, heatmaps = run_model(run.params, run.recipe.sizes, batch, camera)
     picture = (len(rows), camera.height, camera.width)
     background = np.eye(run.recipe.sizes.masks, dtype=np.float32)[0]
@@ -70,8 +72,8 @@ def matched_iou(masks, labels, moved):
     return result
 
 
-def evaluate(run, interactions, truth, progress=None):
-    """All metrics on a data set -> flat dict of floats.
+def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
+    """All metrics on a data set -> flat dict of floats. depth_noise: SD in m of noise on the depth that the model sees.
 
     flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
     an interaction in which nothing moved has no moving point and so no say in it (it still counts for
@@ -87,15 +89,16 @@ def evaluate(run, interactions, truth, progress=None):
     ious, pokes, moved_rows = [], [], []
     for first in range(0, len(interactions), 8):
         rows = np.arange(first, min(first + 8, len(interactions)))
-        batch, prediction, flow, start_heatmaps, end_heatmaps = predict(run, interactions, rows)
+        batch, prediction, flow, start_heatmaps, end_heatmaps = predict(run, interactions, rows, depth_noise)
         pokes.append(poke_from_heatmaps(start_heatmaps, end_heatmaps, settings))
         for i, row in enumerate(rows):
-            points, labels = batch.points[i], truth.labels[row].ravel()
+            labels = truth.labels[row].ravel()
+            points = unproject(interactions.depth_before[row], camera).reshape(-1, 3)  # where they are, without noise
             true = true_scene_flow(points, labels, truth.poses_before[row], truth.poses_after[row])
             length = np.linalg.norm(true, axis=1)
             moving = (length > MOVING) & batch.valid[i]
             still = batch.valid[i] & ~moving
-            error = np.linalg.norm(prediction.points[i] - points - true, axis=1)
+            error = np.linalg.norm(prediction.points[i] - batch.points[i] - true, axis=1)
             true_pixels = optical_flow(points, points + true, camera)
             pixel_error = np.linalg.norm(flow[i].reshape(-1, 2) - true_pixels, axis=1)
             pixel_length = np.linalg.norm(true_pixels, axis=1)
@@ -148,3 +151,54 @@ def poke_errors(pokes, true_pokes):
     turn = pokes[:, 2] - true_pokes[:, 2]
     return (np.linalg.norm(pokes[:, :2] - true_pokes[:, :2], axis=1),
             np.abs((turn + np.pi) % (2 * np.pi) - np.pi))
+
+
+# --- image-pair optical flow, for comparison: sees both pictures, where our model sees one and the poke -------------
+
+# Both methods look at patches of some 8 pixels, as wide as our objects. Enlargement and settings are those, of 18 each,
+# with next to the smallest error of moving pixels on 150 validation pokes (docs/research-log.md).
+ENLARGE = 4
+
+
+def dis_flow(before, after):
+    """Dense inverse search (Kroeger et al.): two grey pictures (H, W) uint8 -> (H, W, 2) px."""
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    return method.calc(before, after, None)
+
+
+def farneback_flow(before, after):
+    """Farneback's polynomial expansion: two grey pictures (H, W) uint8 -> (H, W, 2) px."""
+    return cv2.calcOpticalFlowFarneback(before, after, None, 0.5, 5, 31, 10, 7, 1.5, cv2.OPTFLOW_FARNEBACK_GAUSSIAN)
+
+
+PEERS = {"dis": dis_flow, "farneback": farneback_flow}
+
+
+def image_pair_flow(peer, rgb_before, rgb_after):
+    """The optical flow of one of PEERS between two pictures (H, W, 3) uint8 -> (H, W, 2) px. Paper: Sec. IV-D."""
+    height, width = rgb_before.shape[:2]
+    grey = [cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
+            for rgb in (rgb_before, rgb_after)]
+    flow = PEERS[peer](*grey)
+    return cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / ENLARGE
+
+
+def evaluate_image_pairs(interactions, truth):
+    """End-point errors of the image-pair methods -> {peer_optical_epe_px (moving), peer_optical_epe_all_px}."""
+    sums = {(peer, over): 0.0 for peer in PEERS for over in ("moving", "all")}
+    count = {"moving": 0, "all": 0}
+    for row in range(len(interactions)):
+        points, valid = points_and_validity(interactions.depth_before[row], interactions.camera)
+        true = true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
+        pixels = optical_flow(points, points + true, interactions.camera)
+        where = {"moving": valid & (np.linalg.norm(true, axis=2) > MOVING), "all": valid}
+        for over, mask in where.items():
+            count[over] += int(mask.sum())
+        for peer in PEERS:
+            found = image_pair_flow(peer, interactions.rgb_before[row], interactions.rgb_after[row])
+            error = np.linalg.norm(found - pixels, axis=2)
+            for over, mask in where.items():
+                sums[peer, over] += float(error[mask].sum())
+    return {f"{peer}_optical_epe{'' if over == 'moving' else '_all'}_px": total / max(count[over], 1)
+            for (peer, over), total in sums.items()}

@@ -49,6 +49,15 @@ def chamfer_loss(map_predicted, map_observed):
     return np.sum(map_predicted + map_observed, axis=1)  # Eq. (2)
 
 
+def association_loss(predicted, targets, valid):
+    """What SE3-Nets minimises instead of Chamfer: sum_i |P'_i - T_i|^2, each point's own target known. Paper: Sec. IV-B.
+
+    predicted, targets (B, N, 3) m, valid (B, N) bool -> (B,) m^2.
+    """
+    difference = predicted - targets
+    return np.sum(difference * difference * valid[..., None], axis=(1, 2))
+
+
 # --- 2D -----------------------------------------------------------------------------------------------
 
 def warp_backward(next_images, flow):

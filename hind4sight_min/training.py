@@ -1,6 +1,6 @@
 """Unsupervised training: samples, the loss of one interaction, Adam, one loop, checkpoints.
 
-Nothing here reads the simulator's truth.
+Only the supervised baseline, SE3-Nets (Recipe.association), is given the simulator's truth.
 """
 import math
 from contextlib import contextmanager
@@ -13,8 +13,8 @@ from autograd.tracer import getval
 
 from . import losses, worker_pool
 from .geometry import free_radius, optical_flow, ray_spacing
-from .interactions import (add_depth_noise, cell_centres, cells_of, load_npz, occupied_pixels, points_and_validity,
-                           save_npz)
+from .interactions import (add_depth_noise, associate_with_noise, cell_centres, cells_of, load_npz, occupied_pixels,
+                           points_and_validity, save_npz, true_scene_flow)
 from .networks import (Sizes, encode, forward_model, init_parameters, inverse_model, most_changed, state_embedding,
                        windows)
 from .ops import take_block
@@ -43,15 +43,17 @@ class Batch:
     start_cells: onp.ndarray  # (B,) int
     end_cells: onp.ndarray
     cells: onp.ndarray        # (cells, 2) m: the centres of the arena's cells
+    targets: onp.ndarray = None  # (B, n, 3) m: where each point goes; for SE3-Nets alone
 
 
-def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whole=False):
+def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whole=False, truth=None, association=1):
     """The Batch of some rows of a data set.
 
     mirror, a bool or one per row, shows the arena mirrored at its plane x = 0, which costs no new poke: pictures flip
     left-right, a_x changes sign, a_theta becomes pi - a_theta. This is exact for a camera that is symmetric about
     that plane; ValueError for another. depth_noise: SD in m of Sec. IV-B's depth noise, drawn from `rng`.
-    whole: the whole pictures instead of windows.
+    whole: the whole pictures instead of windows. truth (of these rows): adds the targets of SE3-Nets, with the
+    association noise of Sec. IV-B, in which a point may be taken for any in an `association` px square around it.
     """
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
@@ -75,11 +77,32 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     def cut(pictures):  # (2, B, H, W, ...) -> (2, B, h, w, ...)
         return onp.stack([pictures[(slice(None), i, *part)] for i, part in enumerate(parts)], axis=1)
 
+    targets = None
+    if truth is not None:
+        targets = associated_targets(interactions, rows, mirror, points[0], depth[0], truth, association, rng)
+        targets = cut(targets[None])[0].reshape(len(rows), -1, 3)
     images = cut(rgb).astype(onp.float32) / 255
     points, valid, occupied = (value.reshape(2, len(rows), -1, *value.shape[4:])
                                for value in map(cut, (points, valid, occupied)))
     return Batch(*points, *valid, *losses.seen_in_both(*valid, *occupied), *images, *changed, pokes,
-                 cells_of(starts, settings), cells_of(pokes[:, :2], settings), cell_centres(settings))
+                 cells_of(starts, settings), cells_of(pokes[:, :2], settings), cell_centres(settings), targets)
+
+
+def associated_targets(interactions, rows, mirror, points, depth, truth, window, rng):
+    """Where the truth says every point goes, (B, H, W, 3) m, under the association noise of Sec. IV-B.
+
+    points (B, H, W, 3) m and depth (B, H, W) m as the batch has them: mirrored and noisy.
+    """
+    clean, _ = points_and_validity(interactions.depth_before[rows], interactions.camera)
+    flow = onp.stack([true_scene_flow(*each) for each in zip(clean, truth.labels, truth.poses_before,
+                                                             truth.poses_after)])
+    flow[mirror] = flow[mirror][:, :, ::-1] * onp.float32([-1, 1, 1])
+    targets = points + flow
+    if window > 1:
+        for i, picture in enumerate(depth):
+            taken_for = associate_with_noise(picture, rng, window)
+            targets[i] = targets[i].reshape(-1, 3)[taken_for.ravel()].reshape(points[i].shape)
+    return targets
 
 
 def run_model(params, sizes, batch, camera):
@@ -94,7 +117,12 @@ def run_model(params, sizes, batch, camera):
 
 
 def loss_terms(params, sizes, batch, camera):
-    """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS."""
+    """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS; for a batch with targets, the one
+    term of SE3-Nets.
+    """
+    if batch.targets is not None:
+        prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
+        return {"association": losses.association_loss(prediction.points, batch.targets, batch.valid)}
     prediction, flow, heatmaps = run_model(params, sizes, batch, camera)
     next_embedding = state_embedding(encode(params, batch.next_points), batch.next_valid)
     free = free_radius(batch.points, getval(prediction.points), ray_spacing(batch.points, camera))
@@ -141,6 +169,7 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 # From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
 # See docs/research-log.md.
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0}
+ASSOCIATION_WEIGHTS = {"association": 2e3}  # as much as Chamfer, which counts a point in both directions
 
 
 @dataclass(frozen=True)
@@ -151,6 +180,8 @@ class Recipe:
     then a cosine to zero. ramp: the 2D terms grow from 0 to their weight between these shares of all steps (from a
     cold start they teach the network to move nothing). depth_noise: SD in m of noise added to the depth, Sec. IV-B.
     mirror: show half of the interactions mirrored. weights: one per term of Eq. (6).
+    association: 0, or the baseline SE3-Nets: supervised by the true motion of every point, each of which may be taken
+    for any other in a square of so many pixels around it (1: exact; odd). Then the one weight is that of its loss.
     """
     steps: int = 3000
     batch: int = 16
@@ -162,9 +193,12 @@ class Recipe:
     mirror: bool = True
     weights: dict = field(default_factory=lambda: dict(WEIGHTS))
     sizes: Sizes = Sizes()
+    association: int = 0
 
     def __post_init__(self):
         object.__setattr__(self, "ramp", tuple(self.ramp))
+        if self.association < 0 or self.association and self.association % 2 == 0:
+            raise ValueError(f"association: expected 0 or an odd number of pixels, got {self.association}")
         for name in ("steps", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)}")
@@ -172,8 +206,9 @@ class Recipe:
             raise ValueError(f"learning_rate: expected a finite number > 0, got {self.learning_rate}")
         if not (len(self.ramp) == 2 and 0 <= self.ramp[0] < self.ramp[1]):
             raise ValueError(f"ramp: expected two shares of the steps, 0 <= from < to, got {self.ramp}")
-        if set(self.weights) != set(WEIGHTS) or not all(0 <= value < float("inf") for value in self.weights.values()):
-            raise ValueError(f"weights: expected a finite number >= 0 for each of {sorted(WEIGHTS)}, got {self.weights}")
+        terms = ASSOCIATION_WEIGHTS if self.association else WEIGHTS
+        if set(self.weights) != set(terms) or not all(0 <= value < float("inf") for value in self.weights.values()):
+            raise ValueError(f"weights: expected a finite number >= 0 for each of {sorted(terms)}, got {self.weights}")
 
 
 def learning_rate(recipe, step):
@@ -244,10 +279,10 @@ def rows_of_step(recipe, count, step):
 CHUNK = 8  # interactions per gradient: enough of them to hide autograd's overhead per operation
 
 
-def chunk_gradient(interactions, mirror, noise_seed, weights, vector, layout, recipe):
+def chunk_gradient(interactions, truth, mirror, noise_seed, weights, vector, layout, recipe):
     """`batch_gradient` of a few interactions, weighted by their share of the batch; runs in a worker process."""
     rows, rng = onp.arange(len(interactions)), onp.random.default_rng(noise_seed)
-    batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng)
+    batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng, truth=truth, association=recipe.association)
     terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, weights)
     share = len(rows) / recipe.batch
     return {name: share * value for name, value in terms.items()}, onp.float32(share) * gradient
@@ -270,7 +305,7 @@ def workers(jobs):
         yield apply
 
 
-def training_step(interactions, run, gradients):
+def training_step(interactions, run, gradients, truth=None):
     """One Adam step on the run's next batch; `gradients` comes from `workers`. Adds the batch's terms to run.sums.
 
     Raises FloatingPointError if the gradient is not finite; the run is then as it was.
@@ -278,8 +313,9 @@ def training_step(interactions, run, gradients):
     recipe = run.recipe
     rows, mirror, rng = rows_of_step(recipe, len(interactions), run.step)
     weights, rate = weights_at(recipe, run.step), learning_rate(recipe, run.step)
-    parts = gradients([(interactions[rows[i:i + CHUNK]], mirror[i:i + CHUNK], rng.integers(2 ** 32), weights,
-                        run.vector, run.layout, recipe) for i in range(0, recipe.batch, CHUNK)])
+    chunks = [slice(i, i + CHUNK) for i in range(0, recipe.batch, CHUNK)]
+    parts = gradients([(interactions[rows[chunk]], truth and truth[rows[chunk]], mirror[chunk], rng.integers(2 ** 32),
+                        weights, run.vector, run.layout, recipe) for chunk in chunks])
     gradient = sum(part[1] for part in parts)
     if not onp.isfinite(gradient).all():
         raise FloatingPointError(f"the gradient is not finite at step {run.step}")
@@ -289,10 +325,10 @@ def training_step(interactions, run, gradients):
             run.sums[name] = run.sums.get(name, 0.0) + value
 
 
-def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
+def train(interactions, run, jobs=1, on_epoch=None, on_step=None, truth=None):
     """Go on with a run to its recipe's last step; updates and returns it.
 
-    on_epoch(run), on_step(run) are called after each. The gradient of a batch is the sum over chunks that may
+    truth: for SE3-Nets, and for nothing else. on_epoch(run), on_step(run) are called after each. The gradient of a batch is the sum over chunks that may
     be computed in parallel and are added in order, so the result does not depend on `jobs`.
     Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
     """
@@ -300,10 +336,12 @@ def train(interactions, run, jobs=1, on_epoch=None, on_step=None):
         raise ValueError("interactions: taken with another camera than the run's")
     if jobs < 1:
         raise ValueError(f"jobs: expected a whole number >= 1, got {jobs}")
+    if bool(run.recipe.association) != (truth is not None):
+        raise ValueError("truth: expected for SE3-Nets (Recipe.association), and for nothing else")
     recipe, per_epoch = run.recipe, max(1, len(interactions) // run.recipe.batch)
     with workers(min(jobs, -(-recipe.batch // CHUNK))) as gradients:
         while run.step < recipe.steps:
-            training_step(interactions, run, gradients)
+            training_step(interactions, run, gradients, truth)
             if run.step % per_epoch == 0 or run.step == recipe.steps:
                 first = run.log[-1]["step"] if run.log else 0
                 run.log.append({"epoch": len(run.log) + 1, "step": run.step,

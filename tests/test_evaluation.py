@@ -23,7 +23,7 @@ def shifted_block(data, shift):
 
 def oracle(monkeypatch, data, truth, share, drift=0.0):
     """Make `predict` return `share` of the true motion, `drift` (m) on still points, and perfect heat-maps."""
-    def predict(run, interactions, rows):
+    def predict(run, interactions, rows, depth_noise=0.0):
         batch = make_batch(interactions, rows, whole=True)
         moves = np.zeros_like(batch.points) + np.float32(drift) * np.array([1, 0, 0], np.float32)
         masks = np.zeros(batch.points.shape[:2] + (3,))

@@ -51,7 +51,7 @@ def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
     data, run = pokes_seen(), random_run()
     batch = make_batch(data, np.arange(3))
     for name, value in vars(batch).items():  # float64 throughout
-        if value.dtype == np.float32:
+        if value is not None and value.dtype == np.float32:
             setattr(batch, name, value.astype(float))
     vector, weights = run.vector.astype(float), dict(training.WEIGHTS, photometric=0.0)
     # cv2.remap rounds float64 positions, so the photometric term has finite differences of its own
