@@ -7,13 +7,15 @@ import statistics
 import subprocess
 import sys
 import time
+from multiprocessing import active_children
+from pathlib import Path
 
 
-def serve(contender, workers=0):
+def serve(contender):
     """The process of a contender, a context that gives the function to call.
 
     Per line of input, a number of calls, one line of output, the seconds they took; the last line is the peak resident
-    memory in MB, that of its worker processes added (which have ended by then).
+    memory in MB, with what its worker processes had to themselves: libraries that both use are there once.
     """
     with contender as call:
         for line in sys.stdin:
@@ -21,10 +23,15 @@ def serve(contender, workers=0):
             for _ in range(int(line)):
                 call()
             print(time.perf_counter() - start, flush=True)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if workers:
-        peak += workers * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    print(peak / 1024, flush=True)
+        workers = sum(_own_peak(process.pid) for process in active_children())
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss + workers) / 1024, flush=True)
+
+
+def _own_peak(pid):
+    """The peak resident memory of a process in KB, less the pages it shares now."""
+    kilobytes = {line.split(":")[0]: int(line.split()[1]) for name in ("status", "smaps_rollup")
+                 for line in Path(f"/proc/{pid}/{name}").read_text().splitlines() if line.endswith(" kB")}
+    return kilobytes["VmHWM"] - kilobytes["Shared_Clean"] - kilobytes["Shared_Dirty"]
 
 
 class Contender:

@@ -4,9 +4,10 @@
 
 Every contender makes the same steps on the same pokes: batch, forward, losses, backward, Adam. BLAS has one thread in
 our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
-fastest median counts. Also the floor: how long the bare matrix products of the network and the bare KD-trees of the
-Chamfer distance take, which no implementation can do without (ours avoids searches whose result is known). Some ten
-minutes on two cores.
+fastest median counts. Memory is the peak, a worker's own pages added to its parent's (Linux only).
+
+Also the floor: how long the bare matrix products of the network and the bare KD-trees of the Chamfer distance take,
+which no implementation can do without (ours avoids searches whose result is known). Some ten minutes on two cores.
 """
 import argparse
 import statistics
@@ -67,8 +68,7 @@ def twin(batch, chamfer, mode, threads):
 
 def work(name, batch):
     if name in OURS:
-        jobs = 1 + OURS.index(name)
-        return serve(ours(batch, jobs), workers=jobs - 1)
+        return serve(ours(batch, jobs=1 + OURS.index(name)))
     _, chamfer, mode, threads, _ = name.split("_")
     return serve(twin(batch, chamfer, mode, int(threads)))
 
