@@ -41,7 +41,7 @@ HEADLINES = {
     "shipped_optical_epe_px": ("shipped", "optical_epe_px", "shipped model: optical flow error, moving, px",
                                "{:.2f}", ""),
     "shipped_inverse_target_cm": ("shipped", "inverse_target_cm", "shipped model: median target error, cm",
-                                  "{:.1f}", "< 3"),
+                                  "{:.2f}", "< 3"),
     "shipped_inverse_direction_deg": ("shipped", "inverse_direction_deg", "shipped model: median direction error, deg",
                                       "{:.1f}", "< 30"),
     "collect_share_in_bullet": ("collection", "collect_share_in_bullet", "collection: share of time inside Bullet",

@@ -144,6 +144,12 @@ def test_poke_from_heatmaps_against_the_poke_that_made_them():
     end_map[0, cells_of(target, SETTINGS)], start_map[0, cells_of(start, SETTINGS)] = 1, 1
     found = evaluation.poke_from_heatmaps(start_map, end_map, SETTINGS)
     np.testing.assert_allclose(found[0], [0.0125, -0.0375, -np.pi / 4], atol=1e-9)
+    # A target between two cells, and a second, lower peak far away that does not count.
+    beside = cells_of(target + [0.025, 0], SETTINGS)
+    between, far = end_map.copy(), cells_of(target + [0.15, 0], SETTINGS)
+    between[0, beside], between[0, far] = 0.5, 0.4
+    np.testing.assert_allclose(evaluation.poke_from_heatmaps(start_map, between, SETTINGS)[0, :2],
+                               target[0] + [0.025 / 3, 0], atol=1e-9)
     # A start map spread evenly to both sides of the line gives the same direction.
     offsets = centres - target
     across = np.abs(np.arctan2(*(offsets @ np.array([[1, 1], [-1, 1]])).T[::-1]))
