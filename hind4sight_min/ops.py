@@ -171,7 +171,7 @@ def _dense_vjp(argnums, ans, args, kwargs):
     relu, residual = (kwargs.get(name, False) for name in ("relu", "residual"))
 
     def vjp(g):
-        through = g * (ans > (x if residual else 0)) if relu else g
+        through = g * (ans > (x if residual else 0)) if relu else g  # where the relu let something through
         rows = through.reshape(-1, through.shape[-1])
 
         def on_x():
