@@ -1,12 +1,12 @@
 """Chamfer distance and bilinear warping, value and gradient, against what one would use instead, at several sizes.
 
-    python benchmarks/operations.py --json docs/results/operations.json --figure docs/speed.png
-                                                                            (needs the extra "bench")
+    python benchmarks/operations.py --json docs/results/operations.json     (needs the extra "bench")
+    python benchmarks/operations.py --draw docs/speed.png
 
 Chamfer: our KD-trees against brute force in PyTorch (one and two threads) and point-cloud-utils (its nearest neighbours,
 the gradient in NumPy). Warping: our cv2.remap against PyTorch's grid_sample (one and two threads) and SciPy's
-map_coordinates. Ours uses the threads OpenCV takes by itself, and one for all else. The figure shows these and, where
-docs/results/training_step.json is there, the training step. Some fifteen minutes on two cores.
+map_coordinates. Ours uses the threads OpenCV takes by itself, all cores for the queries of large clouds, and one for all
+else. Some eight minutes on two cores. The drawing shows these and the training step, as they are recorded.
 """
 import argparse
 import json
@@ -130,8 +130,7 @@ def warp(name, height, width):
 # --- the comparison -------------------------------------------------------------------------------------------
 
 def measure(what, names, sizes, rounds, figures):
-    """Race all contenders at all sizes -> {name: [median seconds per size]}, and fill the flat dict of figures."""
-    medians = {name: [] for name in names}
+    """Race all contenders at all sizes, and fill the flat dict of figures."""
     for size in sizes:
         label = "x".join(map(str, size))
         print(f"{what}, {label}", flush=True)
@@ -139,8 +138,6 @@ def measure(what, names, sizes, rounds, figures):
                    if what == "warp" or not name.startswith("torch") or size[0] <= LARGEST_BRUTE]
         times, memory = race(__file__, entered, [what, *size], rounds)
         report(times, memory)
-        for name in names:
-            medians[name].append(statistics.median(times[name]) if name in times else float("nan"))
         for name, values in times.items():
             figures[f"{what}_{label}_{name}_ms"] = 1e3 * statistics.median(values)
             figures[f"{what}_{label}_{name}_mb"] = memory[name]
@@ -155,35 +152,36 @@ def measure(what, names, sizes, rounds, figures):
                             f"{what}_{label}_speedup_vs_{kind}_min": least,
                             f"{what}_{label}_speedup_vs_{kind}_max": most})
             print(f"  ours is {speedup:.2f} ({least:.2f} to {most:.2f}) times as fast as {other}", flush=True)
-    return medians
 
 
-def draw(path, chamfer_seconds, warp_seconds, step_file):
-    step = json.loads(step_file.read_text())["figures"] if step_file.exists() else {}
+def draw(path, operations, step):
+    """The figure of docs/speed.md, from the recorded figures of this benchmark and of training_step.py."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = figure.subplots(1, 3)
-    styles = {"ours": ("#0072B2", "o"), "ours_1": ("#56B4E9", "o"), "torch_1_threads": ("#E69F00", "s"),
-              "torch_2_threads": ("#D55E00", "s"), "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
-    for axis, seconds, sizes, title, unit in (
-            (axes[0], chamfer_seconds, POINTS, "Chamfer distance: grows like N log N", "points"),
-            (axes[1], warp_seconds, [h * w for h, w in PICTURES], "Warping: grid_sample is ahead", "pixels")):
-        for name, values in seconds.items():
+    styles = {"ours": ("#0072B2", "o"), "torch_1_threads": ("#E69F00", "s"), "torch_2_threads": ("#D55E00", "s"),
+              "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
+    for axis, what, names, sizes, title, unit in (
+            (axes[0], "chamfer", CHAMFER, {str(n): n for n in POINTS}, "Chamfer distance: grows like N log N", "points"),
+            (axes[1], "warp", WARP, {f"{h}x{w}": h * w for h, w in PICTURES}, "Warping: grid_sample is ahead", "pixels")):
+        for name in names:
             colour, marker = styles[name]
-            axis.loglog(sizes, 1e3 * np.array(values), color=colour, marker=marker, label=name.replace("_", " "))
+            values = [operations.get(f"{what}_{label}_{name}_ms", np.nan) for label in sizes]
+            axis.loglog(list(sizes.values()), values, color=colour, marker=marker, label=name.replace("_", " "))
         axis.set(title=title, xlabel=unit, ylabel="ms, value and gradient")
         axis.legend(fontsize=7)
     n = np.array(POINTS, float)
-    axes[0].loglog(n, 1e3 * chamfer_seconds["ours"][0] * n * np.log(n) / (n[0] * np.log(n[0])), ":", color="grey")
-    batches = sorted({int(name.split("_batch_")[1].split("_")[0]) for name in step if name.endswith("_ms")
-                      and "_batch_" in name})
+    scale = operations["chamfer_10000_ours_ms"] / (1e4 * np.log(1e4))
+    axes[0].loglog(n, scale * n * np.log(n), ":", color="grey")
+    batches = (4, 16, 64)
     for name, colour, marker, label in (("ours_1_process", "#56B4E9", "o", "ours, 1 process"),
                                         ("ours_2_processes", "#0072B2", "o", "ours, 2 processes"),
                                         ("torch_tree_eager_1_threads", "#E69F00", "s", "torch, 1 thread"),
                                         ("torch_tree_eager_2_threads", "#D55E00", "s", "torch, 2 threads")):
-        values = [step.get(f"{name}_batch_{batch}_ms", float("nan")) for batch in batches]
+        values = [step.get(f"{name}_batch_{batch}_ms", np.nan) for batch in batches]
         axes[2].loglog(batches, values, color=colour, marker=marker, label=label)
     axes[2].set(title="A training step of the full model", xlabel="interactions per step", ylabel="ms")
     axes[2].set_xticks(batches, labels=batches)
+    axes[2].set_yticks([30, 100, 300], labels=[30, 100, 300])
     axes[2].minorticks_off()
     axes[2].legend(fontsize=7)
     with whole_file(path) as temporary:
@@ -194,17 +192,21 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json")
-    parser.add_argument("--figure")
+    parser.add_argument("--draw", metavar="PNG", help="measure nothing; draw what docs/results has")
     parser.add_argument("--contender", help=argparse.SUPPRESS)
     parser.add_argument("task", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.contender:
         what, *size = args.task
         return serve({"chamfer": chamfer, "warp": warp}[what](args.contender, *map(int, size)))
+    if args.draw:
+        results = Path(__file__).resolve().parent.parent / "docs" / "results"
+        return draw(args.draw, *(json.loads((results / f"{name}.json").read_text())["figures"]
+                                 for name in ("operations", "training_step")))
     figures = {}
-    chamfer_seconds = measure("chamfer", CHAMFER, [(count,) for count in POINTS], args.rounds, figures)
-    warp_seconds = measure("warp", WARP, PICTURES, args.rounds, figures)
-    cost = {count: seconds / (count * np.log(count)) for count, seconds in zip(POINTS, chamfer_seconds["ours"])}
+    measure("chamfer", CHAMFER, [(count,) for count in POINTS], args.rounds, figures)
+    measure("warp", WARP, PICTURES, args.rounds, figures)
+    cost = {count: figures[f"chamfer_{count}_ours_ms"] / (count * np.log(count)) for count in (10000, 100000)}
     figures["chamfer_growth_over_nlogn_10k_to_100k"] = cost[100000] / cost[10000]
     figures["chamfer_speedup_vs_torch_10k"] = figures["chamfer_10000_speedup_vs_torch"]
     figures["warp_speedup_vs_grid_sample_min"] = min(figures[f"warp_{h}x{w}_speedup_vs_torch"] for h, w in PICTURES)
@@ -212,9 +214,6 @@ def main():
                  "warp_speedup_vs_grid_sample_min"):
         print(f"{name}: {figures[name]:.2f}")
     write_json(args.json, figures)
-    if args.figure:
-        draw(Path(args.figure), chamfer_seconds, warp_seconds,
-             Path(__file__).resolve().parent.parent / "docs" / "results" / "training_step.json")
 
 
 if __name__ == "__main__":
