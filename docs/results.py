@@ -20,12 +20,14 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+from hind4sight_min import reproduce
 from hind4sight_min.__main__ import write_text
 from hind4sight_min.training import load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"
 BEGIN, END = "<!-- figures: written by docs/results.py from docs/results/summary.json -->", "<!-- /figures -->"
+TABLES_BEGIN, TABLES_END = "<!-- tables: written by docs/results.py from docs/results/reproduce.json -->", "<!-- /tables -->"
 
 # headline figure -> (recorded result, its name there, what the README says, format, goal)
 HEADLINES = {
@@ -60,6 +62,24 @@ HEADLINES = {
                                      "Chamfer of 10,000 points: speed against brute-force PyTorch", "{:.0f}", ">= 30"),
     "warp_speedup_vs_grid_sample_min": ("operations", "warp_speedup_vs_grid_sample_min",
                                         "warping: speed against grid_sample, at its worst size", "{:.2f}", ">= 1"),
+    "flow_mse_ratio_clean": ("reproduce", "flow_mse_ratio_clean", "paper: squared flow error / no motion", "{:.3f}",
+                             "<= 0.110"),
+    "flow_mse_ratio_noisy": ("reproduce", "flow_mse_ratio_noisy", "paper: the same, 1 cm depth noise", "{:.3f}",
+                             "<= 0.125"),
+    "noisy_over_se3nets_da11": ("reproduce", "noisy_over_se3nets_da11", "paper: against SE3-Nets 11 x 11, both noises",
+                                "{:.2f}", "<= 0.74"),
+    "ablation_order_holds": ("reproduce", "ablation_order_holds", "paper: order of the ablation holds (1: yes)", "{:.0f}",
+                             "1"),
+    "optical_epe_over_best_peer_moving": ("reproduce", "optical_epe_over_best_peer_moving",
+                                          "paper: optical flow against image pairs, moving", "{:.2f}", "<= 0.45"),
+    "optical_epe_over_best_peer_all": ("reproduce", "optical_epe_over_best_peer_all",
+                                       "paper: optical flow against image pairs, all", "{:.2f}", "<= 0.45"),
+    "mask_iou": ("reproduce", "mask_iou", "paper: IoU of moved objects and masks", "{:.2f}", ">= 0.80"),
+    "inverse_target_cells": ("reproduce", "inverse_target_cells", "paper: median target error, cells", "{:.2f}", "< 1"),
+    "inverse_direction_deg": ("reproduce", "inverse_direction_deg", "paper: median direction error, deg", "{:.1f}",
+                              "< 15"),
+    "unseen_over_seen": ("reproduce", "unseen_over_seen", "paper: unseen objects against seen ones", "{:.2f}", "<= 1.5"),
+    "train_minutes": ("reproduce", "train_minutes", "paper: minutes of training", "{:.0f}", "< 60"),
     "import_seconds": ("startup", "import_seconds", "import, seconds", "{:.2f}", "< 1"),
 }
 
@@ -116,11 +136,24 @@ def table(summary):
     return "\n".join(lines)
 
 
+def paper_tables():
+    """The paper's tables with ours beside them, once the full runs are recorded."""
+    path = RESULTS / "reproduce.json"
+    if not path.exists():
+        return "The full runs take a night and are not recorded yet; `--quick` shows the tables in miniature."
+    return reproduce.tables_text(list(reproduce.TABLES), json.loads(path.read_text())["figures"])
+
+
+def replaced(text, begin, end, content):
+    before, rest = text.split(begin)
+    _, after = rest.split(end)
+    return f"{before}{begin}\n{content}\n{end}{after}"
+
+
 def readme_with(text, summary):
-    """The README's text with its table replaced."""
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    return f"{before}{BEGIN}\n{table(summary)}\n{END}{after}"
+    """The README's text with its tables replaced."""
+    text = replaced(text, BEGIN, END, table(summary))
+    return replaced(text, TABLES_BEGIN, TABLES_END, paper_tables())
 
 
 def main(arguments):
