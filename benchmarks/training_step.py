@@ -16,7 +16,7 @@ from contextlib import contextmanager
 
 import numpy as np
 from autograd import grad
-from autograd.tracer import isbox
+from autograd.tracer import getval, isbox
 from race import fastest, race, ratios, report, serve
 from scipy.spatial import cKDTree
 
@@ -127,7 +127,7 @@ def floors(rounds, batch_size=8):
             np.matmul(a, b)
 
     def chamfer(predicted, spare):
-        free = (geometry.free_radius(batch.points, getattr(predicted, "_value", predicted),
+        free = (geometry.free_radius(batch.points, getval(predicted),
                                      geometry.ray_spacing(batch.points, data.camera)),
                 geometry.ray_spacing(batch.next_points, data.camera)) if spare else ()
         maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared, *free)

@@ -29,7 +29,7 @@ class Scale:
 
 
 FULL = Scale()
-QUICK = Scale(train_pokes=600, test_pokes=100, steps=100, long_steps=200, seeds=(1, 2))
+QUICK = Scale(train_pokes=600, test_pokes=100, steps=200, long_steps=300, seeds=(1, 2))
 
 
 def _only(*terms):
