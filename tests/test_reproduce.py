@@ -9,6 +9,7 @@ from test_evaluation import shifted_block
 from test_training import TINY, pokes_seen
 
 from hind4sight_min import evaluation, reproduce, training
+from hind4sight_min.__main__ import main
 from hind4sight_min.reproduce import MODELS, Cell, Scale
 
 TINY_SCALE = Scale(train_pokes=7, test_pokes=7, steps=3, long_steps=4, seeds=(1, 2))
@@ -190,3 +191,21 @@ def test_image_pair_errors_against_a_made_up_flow(monkeypatch):
     for peer in evaluation.PEERS:
         assert found[f"{peer}_optical_epe_px"] == pytest.approx(plain["no_motion_optical_epe_px"], rel=1e-3)
         assert found[f"{peer}_optical_epe_all_px"] == pytest.approx(plain["no_motion_optical_epe_all_px"], rel=1e-3)
+
+
+def test_the_whole_command_on_next_to_nothing(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pybullet", reason="the simulator needs pybullet")
+    monkeypatch.setattr(reproduce, "QUICK", Scale(train_pokes=12, test_pokes=12, steps=1, long_steps=1, seeds=(1, 2)))
+    arguments = ["reproduce", "optical-flow", "--quick", "--out", str(tmp_path), "--jobs", "2"]
+    assert main(arguments) == 0
+    first = capsys.readouterr().out
+    assert "4 of 4" in first and "| full model | depth and poke |" in first
+    figures = json.loads((tmp_path / "optical-flow.json").read_text())
+    assert figures["full_clean_long_flow_mse_ratio"] == pytest.approx(1, abs=0.1)  # one step: hardly any motion
+    assert 0 < figures["optical_epe_over_best_peer_all"] < np.inf
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    assert main(arguments) == 0  # everything is there: nothing is made again
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == stamps
+    assert json.loads((tmp_path / "optical-flow.json").read_text()) == figures
+    assert main(["reproduce", "optical-flow", "--out", str(tmp_path)]) == 2  # of another scale
+    assert "another scale" in capsys.readouterr().err
