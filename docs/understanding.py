@@ -2,10 +2,13 @@
 
     python docs/understanding.py
 
-Reads the shipped checkpoint, the shipped test pokes and their truth; writes docs/landscape.png, docs/failures.png and
-docs/understanding.md's table of gradient norms. About a minute.
+Reads the shipped checkpoint, the shipped test pokes and their truth, and simulates pokes of objects never trained on;
+writes docs/landscape.png, failures.png, emergent.png and the table of gradient norms in docs/understanding.md. About a
+minute.
 """
 import argparse
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,8 @@ from hind4sight_min.__main__ import data_small, write_text
 from hind4sight_min.figures import _arrow, _blend, _show, flow_to_rgb, save_figure
 from hind4sight_min.geometry import optical_flow, project
 from hind4sight_min.interactions import load_interactions, load_truth, true_scene_flow
+from hind4sight_min.objects import HELD_OUT
+from hind4sight_min.simulator import Settings, collect
 
 DOCS = Path(__file__).resolve().parent
 BEGIN, END = "<!-- norms: written by docs/understanding.py -->", "<!-- /norms -->"
@@ -98,10 +103,9 @@ def norms_table(runs, interactions):
     return "\n".join(lines)
 
 
-def failures(run, interactions, truth):
-    """The worst poke of each kind: a second object hit, a wall met, a soft mask, a turn missed."""
-    camera, worst = interactions.camera, {}
-    half = interactions.meta["settings"]["arena"] / 2
+def predictions(run, interactions, truth):
+    """For every poke that moved something: a dict of what is predicted, what is true, and how large the error is."""
+    camera = interactions.camera
     for first in range(0, len(interactions), 40):
         rows = np.arange(first, min(first + 40, len(interactions)))
         batch, prediction, flow, *_ = evaluation.predict(run, interactions, rows)
@@ -109,35 +113,66 @@ def failures(run, interactions, truth):
             true = true_scene_flow(batch.points[i], truth.labels[row].ravel(), truth.poses_before[row],
                                    truth.poses_after[row])
             moving = (np.linalg.norm(true, axis=1) > evaluation.MOVING) & batch.valid[i]
-            labels = moved_labels(truth, row)
-            if not moving.any() or not len(labels):
-                continue
-            error = ((prediction.points[i] - batch.points[i] - true)[moving] ** 2).sum()
-            at_wall = np.abs(truth.poses_after[row, labels - 1, :2]).max() > half - 0.045
-            turn = max(Rotation.from_quat(truth.poses_after[row, k - 1, 3:]).inv().__mul__(
-                Rotation.from_quat(truth.poses_before[row, k - 1, 3:])).magnitude() for k in labels)
-            soft = 1 - prediction.masks[i][moving, 1:].sum(axis=1).mean()
-            kinds = {"a second object is hit": len(labels) > 1, "a wall stops it": at_wall and len(labels) == 1,
-                     "it turns more than 40\u00b0": turn > np.radians(40) and len(labels) == 1 and not at_wall,
-                     "its mask stays soft": soft > 0.4 and len(labels) == 1 and not at_wall}
-            for kind, holds in kinds.items():
-                if holds and error > worst.get(kind, (0,))[0]:
-                    worst[kind] = (error, row, prediction.masks[i], flow[i],
-                                   optical_flow(batch.points[i], batch.points[i] + true, camera))
-    figure = Figure(figsize=(10, 2.2 * len(worst)), layout="constrained")
-    axes = figure.subplots(len(worst), 4, squeeze=False)
-    shape = (camera.height, camera.width)
-    for line, (kind, (_, row, masks, flow, true)) in zip(axes, worst.items()):
-        image = interactions.rgb_before[row] / 255
-        true = true.reshape(*shape, 2)
+            if moving.any():
+                yield {"row": row, "labels": moved_labels(truth, row), "masks": prediction.masks[i], "flow": flow[i],
+                       "softness": 1 - prediction.masks[i][moving, 1:].sum(axis=1).mean(),
+                       "error": ((prediction.points[i] - batch.points[i] - true)[moving] ** 2).sum(),
+                       "motion": (true[moving] ** 2).sum(),
+                       "true": optical_flow(batch.points[i], batch.points[i] + true, camera)}
+
+
+def draw(examples):
+    """[(what it shows, data set, one of `predictions`)] -> a figure with a row for each."""
+    figure = Figure(figsize=(10, 2.2 * len(examples)), layout="constrained")
+    for line, (title, data, found) in zip(figure.subplots(len(examples), 4, squeeze=False), examples):
+        shape, row = (data.camera.height, data.camera.width), found["row"]
+        true = found["true"].reshape(*shape, 2)
         scale = np.linalg.norm(true, axis=2).max()
-        _show(line[0], image, f"Before: {kind}")
-        ends = np.array([[*interactions.starts[row], 0.02], [*interactions.pokes[row, :2], 0.02]])
-        _arrow(line[0], *project(ends, camera))
-        _show(line[1], _blend(image, masks.reshape(*shape, -1)[..., 1:]), "Predicted masks")
-        _show(line[2], flow_to_rgb(flow, scale), "Predicted optical flow")
+        image = data.rgb_before[row] / 255
+        _show(line[0], image, title.capitalize())
+        ends = np.array([[*data.starts[row], 0.02], [*data.pokes[row, :2], 0.02]])
+        _arrow(line[0], *project(ends, data.camera))
+        _show(line[1], _blend(image, found["masks"].reshape(*shape, -1)[..., 1:]), "Predicted masks")
+        _show(line[2], flow_to_rgb(found["flow"], scale), "Predicted optical flow")
         _show(line[3], flow_to_rgb(true, scale), "True optical flow, same colours")
     return figure
+
+
+def turn_of(truth, row, label):
+    """By how much a poke turned an object, rad."""
+    before, after = (Rotation.from_quat(poses[row, label - 1, 3:]) for poses in (truth.poses_before, truth.poses_after))
+    return (after * before.inv()).magnitude()
+
+
+def failures(run, interactions, truth):
+    """The worst poke of each kind: a second object hit, a wall met, a soft mask, a turn missed."""
+    half, worst = interactions.meta["settings"]["arena"] / 2, {}
+    for found in predictions(run, interactions, truth):
+        row, labels = found["row"], found["labels"]
+        at_wall = np.abs(truth.poses_after[row, labels - 1, :2]).max(initial=0) > half - 0.045
+        free = len(labels) == 1 and not at_wall
+        kinds = {"a second object is hit": len(labels) > 1, "a wall stops it": at_wall and len(labels) == 1,
+                 "it turns more than 40\u00b0": free and turn_of(truth, row, labels[0]) > np.radians(40),
+                 "its mask stays soft": free and found["softness"] > 0.4}
+        for kind, holds in kinds.items():
+            if holds and (kind not in worst or found["error"] > worst[kind]["error"]):
+                worst[kind] = found
+    return draw([(kind, interactions, found) for kind, found in sorted(worst.items())])
+
+
+def emergent(run, interactions, truth, pokes=120):
+    """Pokes never seen, of objects seen and of kinds and textures never seen: the median one and the quartiles."""
+    settings = replace(Settings(), kinds=HELD_OUT["kinds"], textures=HELD_OUT["textures"])
+    examples = []
+    with tempfile.TemporaryDirectory() as folder:
+        collect(Path(folder), pokes, 102, settings, jobs=2)
+        unseen = load_interactions(folder), load_truth(folder)
+    for name, (data, labels) in (("known kinds", (interactions, truth)), ("new kinds", unseen)):
+        found = [each for each in predictions(run, data, labels) if each["motion"] > 0.03]  # m^2: well moved
+        found.sort(key=lambda each: each["error"] / each["motion"])
+        for share, where in ((0.25, "best quarter"), (0.5, "median"), (0.75, "worst quarter")):
+            examples.append((f"{name}, {where}", data, found[int(share * len(found))]))
+    return draw(examples)
 
 
 def main():
@@ -148,6 +183,7 @@ def main():
     shipped = training.load_run(data_small() / "checkpoint.npz")
     save_figure(landscape(interactions, truth), args.out / "landscape.png")
     save_figure(failures(shipped, interactions, truth), args.out / "failures.png")
+    save_figure(emergent(shipped, interactions, truth), args.out / "emergent.png")
     train = load_interactions(data_small() / "train")
     early = training.start_run(training.Recipe(steps=100), train)
     training.train(train, early)
