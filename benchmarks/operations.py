@@ -3,10 +3,10 @@
     python benchmarks/operations.py --json docs/results/operations.json     (needs the extra "bench")
     python benchmarks/operations.py --draw docs/speed.png
 
-Chamfer: our KD-trees against brute force in PyTorch (one and two threads) and point-cloud-utils (its nearest neighbours,
-the gradient in NumPy). Warping: our cv2.remap against PyTorch's grid_sample (one and two threads) and SciPy's
-map_coordinates. Ours uses the threads OpenCV takes by itself, all cores for the queries of large clouds, and one for all
-else. Some eight minutes on two cores. The drawing shows these and the training step, as they are recorded.
+Chamfer: our KD-trees against brute force in PyTorch (one and two threads) and point-cloud-utils (its nearest
+neighbours, the gradient in NumPy). Warping: our cv2.remap against PyTorch's grid_sample (one and two threads) and
+SciPy's map_coordinates. Ours uses the threads OpenCV takes by itself, all cores for the queries of large clouds, and
+one for all else. Some eight minutes on two cores. The drawing shows these and the training step, as they are recorded.
 """
 import argparse
 import json
@@ -35,7 +35,7 @@ LARGEST_BRUTE = 30000  # points: beyond it a matrix of all pairs takes minutes
 # --- Chamfer ---------------------------------------------------------------------------------------------------
 
 def clouds(count):
-    """A bumpy surface as a depth picture shows it, row by row, before and after it moved by 5 mm of noise: (count, 3)."""
+    """A bumpy surface as a depth picture shows it, row by row, before and after 5 mm of noise: (count, 3) each."""
     rng = np.random.default_rng(0)
     columns = int(np.ceil(np.sqrt(count)))
     xy = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, columns)] * 2), axis=-1).reshape(-1, 2)[:count]
@@ -161,8 +161,8 @@ def draw(path, operations, step):
     styles = {"ours": ("#0072B2", "o"), "torch_1_threads": ("#E69F00", "s"), "torch_2_threads": ("#D55E00", "s"),
               "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
     for axis, what, names, sizes, title, unit in (
-            (axes[0], "chamfer", CHAMFER, {str(n): n for n in POINTS}, "Chamfer distance: grows like N log N", "points"),
-            (axes[1], "warp", WARP, {f"{h}x{w}": h * w for h, w in PICTURES}, "Warping: grid_sample is ahead", "pixels")):
+            (axes[0], "chamfer", CHAMFER, {str(n): n for n in POINTS}, "Chamfer distance: like N log N", "points"),
+            (axes[1], "warp", WARP, {f"{h}x{w}": h * w for h, w in PICTURES}, "Warping: behind grid_sample", "pixels")):
         for name in names:
             colour, marker = styles[name]
             values = [operations.get(f"{what}_{label}_{name}_ms", np.nan) for label in sizes]

@@ -27,7 +27,8 @@ from hind4sight_min.training import load_run, save_run
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"
 BEGIN, END = "<!-- figures: written by docs/results.py from docs/results/summary.json -->", "<!-- /figures -->"
-TABLES_BEGIN, TABLES_END = "<!-- tables: written by docs/results.py from docs/results/reproduce.json -->", "<!-- /tables -->"
+TABLES_BEGIN = "<!-- tables: written by docs/results.py from docs/results/reproduce.json -->"
+TABLES_END = "<!-- /tables -->"
 
 # headline figure -> (recorded result, its name there, what the README says, format, goal)
 HEADLINES = {
@@ -68,8 +69,8 @@ HEADLINES = {
                              "<= 0.125"),
     "noisy_over_se3nets_da11": ("reproduce", "noisy_over_se3nets_da11", "paper: against SE3-Nets 11 x 11, both noises",
                                 "{:.2f}", "<= 0.74"),
-    "ablation_order_holds": ("reproduce", "ablation_order_holds", "paper: order of the ablation holds (1: yes)", "{:.0f}",
-                             "1"),
+    "ablation_order_holds": ("reproduce", "ablation_order_holds", "paper: order of the ablation holds (1: yes)",
+                             "{:.0f}", "1"),
     "optical_epe_over_best_peer_moving": ("reproduce", "optical_epe_over_best_peer_moving",
                                           "paper: optical flow against image pairs, moving", "{:.2f}", "<= 0.45"),
     "optical_epe_over_best_peer_all": ("reproduce", "optical_epe_over_best_peer_all",
@@ -78,7 +79,8 @@ HEADLINES = {
     "inverse_target_cells": ("reproduce", "inverse_target_cells", "paper: median target error, cells", "{:.2f}", "< 1"),
     "inverse_direction_deg": ("reproduce", "inverse_direction_deg", "paper: median direction error, deg", "{:.1f}",
                               "< 15"),
-    "unseen_over_seen": ("reproduce", "unseen_over_seen", "paper: unseen objects against seen ones", "{:.2f}", "<= 1.5"),
+    "unseen_over_seen": ("reproduce", "unseen_over_seen", "paper: unseen objects against seen ones", "{:.2f}",
+                         "<= 1.5"),
     "train_minutes": ("reproduce", "train_minutes", "paper: minutes of training", "{:.0f}", "< 60"),
     "import_seconds": ("startup", "import_seconds", "import, seconds", "{:.2f}", "< 1"),
 }

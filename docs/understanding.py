@@ -25,7 +25,8 @@ from hind4sight_min.simulator import Settings, collect
 
 DOCS = Path(__file__).resolve().parent
 BEGIN, END = "<!-- norms: written by docs/understanding.py -->", "<!-- /norms -->"
-COLOURS = {"chamfer": "#0072B2", "distance_smoothness": "#56B4E9", "photometric": "#D55E00", "flow_smoothness": "#E69F00"}
+COLOURS = {"chamfer": "#0072B2", "distance_smoothness": "#56B4E9", "photometric": "#D55E00",
+           "flow_smoothness": "#E69F00"}
 
 
 def moved_labels(truth, row):
@@ -40,8 +41,8 @@ def terms_at(batch, moves, camera):
     maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared)
     flow = optical_flow(batch.points, predicted, camera).reshape(batch.images.shape[:3] + (2,))
     values = {"chamfer": losses.chamfer_loss(*maps),
-              "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images, batch.shared,
-                                                                     batch.next_shared),
+              "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
+                                                                     batch.shared, batch.next_shared),
               "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
               "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid)}
     return {name: training.WEIGHTS[name] * value for name, value in values.items()}
@@ -54,7 +55,8 @@ def landscape(interactions, truth, count=60):
     axes = figure.subplots(2, 2, sharey="row")
     scales, angles = np.linspace(-0.5, 2, 26), np.linspace(-60, 60, 25)
     for line, noise in enumerate((0.0, 0.01)):
-        batch = training.make_batch(interactions, rows, depth_noise=noise, rng=np.random.default_rng(0), truth=truth[rows])
+        batch = training.make_batch(interactions, rows, depth_noise=noise, rng=np.random.default_rng(0),
+                                    truth=truth[rows])
         true = batch.targets - batch.points
         moving = np.linalg.norm(true, axis=2) > 1e-4
         after = batch.points + true
@@ -85,16 +87,16 @@ def gradient_norms(run, interactions, count=40):
     found = {}
     for term in training.WEIGHTS:
         weights = {name: float(name == term) for name in training.WEIGHTS}
-        each = np.stack([training.batch_gradient(run.vector, run.layout, run.recipe.sizes,
-                                                 training.make_batch(interactions, np.array([row])), interactions.camera,
-                                                 weights)[1] for row in range(count)])
+        batches = (training.make_batch(interactions, np.array([row])) for row in range(count))
+        each = np.stack([training.batch_gradient(run.vector, run.layout, run.recipe.sizes, batch, interactions.camera,
+                                                 weights)[1] for batch in batches])
         found[term] = np.linalg.norm(each.mean(axis=0)), np.median(np.linalg.norm(each, axis=1))
     return found
 
 
 def norms_table(runs, interactions):
-    lines = ["| term | weight | " + " | ".join(f"{name}: mean gradient, weighted | one poke's, weighted" for name in runs)
-             + " |", "|---|---|" + "---|---|" * len(runs)]
+    columns = " | ".join(f"{name}: mean gradient, weighted | one poke's, weighted" for name in runs)
+    lines = [f"| term | weight | {columns} |", "|---|---|" + "---|---|" * len(runs)]
     norms = {name: gradient_norms(run, interactions) for name, run in runs.items()}
     for term, weight in training.WEIGHTS.items():
         values = " | ".join(f"{weight * mean:.3g} | {weight * single:.3g}" for mean, single in

@@ -182,8 +182,8 @@ PEERS = {"dis": dis_flow, "farneback": farneback_flow}
 def image_pair_flow(peer, rgb_before, rgb_after):
     """The optical flow of one of PEERS between two pictures (H, W, 3) uint8 -> (H, W, 2) px. Paper: Sec. IV-E."""
     height, width = rgb_before.shape[:2]
-    grey = [cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)
-            for rgb in (rgb_before, rgb_after)]
+    grey = [cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (ENLARGE * width, ENLARGE * height),
+                       interpolation=cv2.INTER_CUBIC) for rgb in (rgb_before, rgb_after)]
     flow = PEERS[peer](*grey)
     return cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA) / ENLARGE
 

@@ -50,8 +50,9 @@ def chamfer_loss(map_predicted, map_observed):
 
 
 def association_loss(predicted, targets, valid):
-    """What SE3-Nets minimises instead of Chamfer: sum_i |P'_i - T_i|^2, each point's own target known. Paper: Sec. IV-D.
+    """What SE3-Nets minimises instead of Chamfer: sum_i |P'_i - T_i|^2, each point's own target known.
 
+    Paper: Sec. IV-D.
     predicted, targets (B, N, 3) m, valid (B, N) bool -> (B,) m^2.
     """
     difference = predicted - targets

@@ -271,7 +271,8 @@ def most_changed(points, next_points, valid):
     rows = onp.argpartition(-change, count - 1, axis=1)[:, :count]
     weights = onp.take_along_axis(change, rows, axis=1)
     pick = (onp.arange(len(points))[:, None], rows)
-    return points[pick], next_points[pick], weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
+    weights = weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
+    return points[pick], next_points[pick], weights
 
 
 def inverse_model(params, before, after, weights, cells):

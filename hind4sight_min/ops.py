@@ -269,7 +269,7 @@ def weighted_means(x, weights, floor=1e-3):
 
 
 def _shares(weights, floor):
-    """(B, K, N) and (B, 1, K): the weights over their sum, and the sum; as a product, np.sum is slow along this axis."""
+    """The weights over their sum (B, K, N), and the sum (B, 1, K): as a product, np.sum is slow along this axis."""
     total = np.matmul(np.ones((1, weights.shape[1]), weights.dtype), weights) + weights.dtype.type(floor)
     return np.swapaxes(weights / total, 1, 2), total
 

@@ -36,9 +36,9 @@ def _only(*terms):
     return {name: value * (name in terms) for name, value in training.WEIGHTS.items()}
 
 
-# name -> (what the table says, what its recipe changes). SE3-Nets is our network with its loss. The paper's windows of 9
-# and 11 pixels are printed without the picture's size; SE3-Nets' has 320 columns, five times ours, where they span what
-# 3 pixels do here. Both are shown.
+# name -> (what the table says, what its recipe changes). SE3-Nets is our network with its loss. The paper gives windows
+# of 9 and 11 pixels but not the picture's size; SE3-Nets' has 320 columns, five times ours, where they span what 3
+# pixels do here. Both are shown.
 MODELS = {
     "se3nets_0": ("SE3-Nets, exact association", {"association": 1}),
     "se3nets_9": ("SE3-Nets, 9 x 9 px", {"association": 9}),
@@ -184,7 +184,7 @@ METRICS = ("flow_mse_cm2", "flow_mse_ratio", "still_epe_cm", "mask_iou", "optica
 
 
 def summarise(results, scale):
-    """{Cell: metrics} -> mean and SD over the seeds of every metric, as a flat dict; and the paper's claims, checked."""
+    """{Cell: metrics} -> mean and SD over the seeds of every metric, a flat dict; and what the paper claims of them."""
     figures = {}
     for cell in results:
         if cell.seed == scale.seeds[0]:
@@ -242,8 +242,8 @@ def _pm(figures, key, form="{:.2f}"):
 
 def flow_table(figures, models, title):
     """Table I of the paper, ours beside it: flow MSE, relative to no motion, of every model without and with noise."""
-    lines = [f"| {title} | paper, no noise | ours, no noise | paper, 1 cm noise | ours, 1 cm noise | ours, cm^2, no noise "
-             "| ours, cm^2, 1 cm noise |", "|---|---|---|---|---|---|---|"]
+    lines = [f"| {title} | paper, no noise | ours, no noise | paper, 1 cm noise | ours, 1 cm noise "
+             "| ours, cm^2, no noise | ours, cm^2, 1 cm noise |", "|---|---|---|---|---|---|---|"]
     for key in models + (["full_long"] if "full" in models else []):
         model, long = (key.removesuffix("_long"), key.endswith("_long"))
         text = MODELS[model][0] + (", trained long" if long else "")
@@ -259,7 +259,8 @@ def flow_table(figures, models, title):
 
 def optical_table(figures):
     """Table III of the paper, ours beside it."""
-    lines = ["| optical flow, end-point error | sees | paper | moving pixels, px | all pixels, px |", "|---|---|---|---|---|"]
+    lines = ["| optical flow, end-point error | sees | paper | moving pixels, px | all pixels, px |",
+             "|---|---|---|---|---|"]
     for peer in evaluation.PEERS:
         if f"{peer}_optical_epe_px" in figures:
             lines.append(f"| {peer} (FlowNet 2.0 in the paper) | both pictures | {OPTICAL_PAPER['peer']} | "

@@ -290,7 +290,7 @@ def chunk_gradient(interactions, truth, mirror, noise_seed, weights, vector, lay
 
 @contextmanager
 def workers(jobs):
-    """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes: this one and others.
+    """A function that applies `chunk_gradient` to a list of arguments in order, on `jobs` processes, this one included.
 
     Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
     """
@@ -328,8 +328,9 @@ def training_step(interactions, run, gradients, truth=None):
 def train(interactions, run, jobs=1, on_epoch=None, on_step=None, truth=None):
     """Go on with a run to its recipe's last step; updates and returns it.
 
-    truth: for SE3-Nets, and for nothing else. on_epoch(run), on_step(run) are called after each. The gradient of a batch is the sum over chunks that may
-    be computed in parallel and are added in order, so the result does not depend on `jobs`.
+    truth: for SE3-Nets, and for nothing else. on_epoch(run), on_step(run) are called after each. The gradient of a
+    batch is the sum over chunks that may be computed in parallel and are added in order, so the result does not depend
+    on `jobs`.
     Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
     """
     if interactions.meta["camera"] != run.meta["camera"]:

@@ -22,13 +22,15 @@ def small_world(monkeypatch):
     truth = shifted_block(data, (0.02, 0.01, 0.0))
     monkeypatch.setattr(reproduce, "_data", lambda folder: (data, truth))
     full = reproduce.recipe_of
-    monkeypatch.setattr(reproduce, "recipe_of", lambda cell, scale: replace(full(cell, scale), sizes=TINY.sizes, batch=4))
+    monkeypatch.setattr(reproduce, "recipe_of",
+                        lambda cell, scale: replace(full(cell, scale), sizes=TINY.sizes, batch=4))
 
 
 def test_every_table_asks_for_its_runs_once():
     cells = reproduce.cells_of_tables(["flow", "ablation", "optical-flow"], reproduce.FULL)
     assert len(cells) == len(set(cells)) == 3 * 2 * (len(MODELS) + 1)
-    assert {cell.model for cell in reproduce.cells_of_tables(["ablation"], reproduce.FULL)} == {"2d", "3d", "2d_3d", "full"}
+    ablation = {cell.model for cell in reproduce.cells_of_tables(["ablation"], reproduce.FULL)}
+    assert ablation == {"2d", "3d", "2d_3d", "full"}
     assert all(cell.long for cell in reproduce.cells_of_tables(["optical-flow"], reproduce.FULL))
     assert len({cell.name for cell in cells}) == len(cells)
 
@@ -96,10 +98,12 @@ def test_summary_against_hand_values():
     figures = reproduce.summarise(made_up(TINY_SCALE), TINY_SCALE)
     assert figures["2d_noisy_flow_mse_cm2"] == pytest.approx(4.55)
     assert figures["2d_noisy_flow_mse_cm2_sd"] == pytest.approx(0.1 / np.sqrt(2))
-    assert figures["flow_mse_ratio_clean"] == pytest.approx(0.65) and figures["flow_mse_ratio_noisy"] == pytest.approx(1.15)
+    assert figures["flow_mse_ratio_clean"] == pytest.approx(0.65)
+    assert figures["flow_mse_ratio_noisy"] == pytest.approx(1.15)
     assert figures["noisy_over_se3nets_da11"] == pytest.approx(1.55 / 6.55)
     assert figures["noisy_over_se3nets_da11_scaled"] == pytest.approx(1.55 / 2.05)
-    assert figures["unseen_over_seen"] == pytest.approx(2) and figures["inverse_target_cells"] == pytest.approx(0.65 / 2.5)
+    assert figures["unseen_over_seen"] == pytest.approx(2)
+    assert figures["inverse_target_cells"] == pytest.approx(0.65 / 2.5)
     assert figures["ablation_order_holds"] == 1.0
     close = reproduce.summarise(made_up(TINY_SCALE, full=(1.95,)), TINY_SCALE)  # better, but within one SD
     assert close["ablation_order_holds"] == 0.0
