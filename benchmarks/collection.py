@@ -11,7 +11,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from hind4sight_min.__main__ import write_json
+from hind4sight_min.interactions import write_json
 from hind4sight_min.simulator import collect
 
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from race import fastest, race, ratios, report, serve
 
 from hind4sight_min import losses
-from hind4sight_min.__main__ import write_json
+from hind4sight_min.interactions import write_json
 from hind4sight_min.interactions import whole_file
 
 CHAMFER = ("ours", "torch_1_threads", "torch_2_threads", "point_cloud_utils")

@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from hind4sight_min.__main__ import write_json
+from hind4sight_min.interactions import write_json
 
 
 def main():

@@ -21,8 +21,8 @@ from race import fastest, race, ratios, report, serve
 from scipy.spatial import cKDTree
 
 from hind4sight_min import geometry, losses, networks, training
-from hind4sight_min.__main__ import data_small, write_json
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.__main__ import data_small
+from hind4sight_min.interactions import load_interactions, write_json
 
 DATA = data_small() / "train"
 OURS = ("ours_1_process", "ours_2_processes")

@@ -21,7 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from hind4sight_min import reproduce
-from hind4sight_min.__main__ import write_text
+from hind4sight_min.interactions import write_text
 from hind4sight_min.training import load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -147,6 +147,7 @@ def paper_tables():
 
 
 def replaced(text, begin, end, content):
+    """`text` with what stands between two markers replaced."""
     before, rest = text.split(begin)
     _, after = rest.split(end)
     return f"{before}{begin}\n{content}\n{end}{after}"

@@ -8,18 +8,18 @@ minute.
 """
 import argparse
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from results import replaced
 from scipy.spatial.transform import Rotation
 
 from hind4sight_min import evaluation, losses, training
-from hind4sight_min.__main__ import data_small, write_text
+from hind4sight_min.__main__ import data_small
 from hind4sight_min.figures import _arrow, _blend, _show, flow_to_rgb, save_figure
 from hind4sight_min.geometry import optical_flow, project
-from hind4sight_min.interactions import load_interactions, load_truth, true_scene_flow
+from hind4sight_min.interactions import load_interactions, load_truth, true_scene_flow, write_text
 from hind4sight_min.objects import HELD_OUT
 from hind4sight_min.simulator import Settings, collect
 
@@ -164,10 +164,9 @@ def failures(run, interactions, truth):
 
 def emergent(run, interactions, truth, pokes=120):
     """Pokes never seen, of objects seen and of kinds and textures never seen: the median one and the quartiles."""
-    settings = replace(Settings(), kinds=HELD_OUT["kinds"], textures=HELD_OUT["textures"])
     examples = []
     with tempfile.TemporaryDirectory() as folder:
-        collect(Path(folder), pokes, 102, settings, jobs=2)
+        collect(Path(folder), pokes, 102, Settings(**HELD_OUT), jobs=2)
         unseen = load_interactions(folder), load_truth(folder)
     for name, (data, labels) in (("known kinds", (interactions, truth)), ("new kinds", unseen)):
         found = [each for each in predictions(run, data, labels) if each["motion"] > 0.03]  # m^2: well moved
@@ -190,10 +189,8 @@ def main():
     early = training.start_run(training.Recipe(steps=100), train)
     training.train(train, early)
     page = args.out / "understanding.md"
-    before, rest = page.read_text().split(BEGIN)
-    _, after = rest.split(END)
     table = norms_table({"after 100 steps": early, "shipped": shipped}, interactions)
-    write_text(page, f"{before}{BEGIN}\n{table}\n{END}{after}")
+    write_text(page, replaced(page.read_text(), BEGIN, END, table))
 
 
 if __name__ == "__main__":

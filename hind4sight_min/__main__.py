@@ -1,6 +1,5 @@
 """The `hind4sight` command: collect, train, evaluate, show, demo, reproduce. `hind4sight COMMAND --help` says more."""
 import argparse
-import json
 import os
 import sys
 import sysconfig
@@ -12,7 +11,7 @@ import numpy as np
 
 from . import evaluation, reproduce, simulator, training
 from .geometry import project
-from .interactions import load_interactions, load_truth, whole_file
+from .interactions import load_interactions, load_truth, write_json, write_text
 from .losses import distance_maps, warp_backward
 from .networks import Sizes
 
@@ -36,17 +35,6 @@ def progress_line(label):
         end = "\n" if done >= total else ""
         print(f"\r{label}: {done} of {total}, {left:.0f} s left \033[K", end=end, file=sys.stderr, flush=True)
     return show
-
-
-def write_text(path, text):
-    """Write a text file, whole or not at all."""
-    with whole_file(path) as temporary:
-        temporary.write_text(text)
-
-
-def write_json(path, figures):
-    if path:
-        write_text(path, json.dumps(figures, indent=2, sort_keys=True) + "\n")
 
 
 def write_log(path, log):
@@ -147,25 +135,16 @@ def run_train(args):
     write_json(args.json, {"train_seconds": seconds, **{f"loss_{k}": v for k, v in run.log[-1].items()}})
 
 
-def train_and_save(run, interactions, path, jobs, save_every=60.0):
+def train_and_save(run, interactions, path, jobs):
     """Train to the recipe's end: a checkpoint every minute, a log line and a CSV row every epoch, then a picture
     of the loss terms. Returns the seconds spent on the whole run, over all calls.
     """
     from . import figures
-    path = Path(path)
-    show, before, start = progress_line("train"), run.meta.get("seconds", 0.0), time.perf_counter()
-    saved = [start]
-
-    def save():
-        run.meta["seconds"] = before + time.perf_counter() - start
-        training.save_run(path, run)
-        saved[0] = time.perf_counter()
+    path, show = Path(path), progress_line("train")
 
     def on_step(run):
         if show:
             show(run.step, run.recipe.steps)
-        if time.perf_counter() - saved[0] > save_every:
-            save()
 
     def on_epoch(run):
         entry = run.log[-1]
@@ -173,10 +152,9 @@ def train_and_save(run, interactions, path, jobs, save_every=60.0):
               + ", ".join(f"{name} {entry[name]:.4g}" for name in run.recipe.weights), flush=True)
         write_log(path.with_suffix(".csv"), run.log)
 
-    training.train(interactions, run, jobs, on_epoch=on_epoch, on_step=on_step)
-    save()
+    seconds = training.train_saving(interactions, run, path, jobs=jobs, on_epoch=on_epoch, on_step=on_step)
     figures.save_figure(figures.training_figure(run.log), path.with_suffix(".png"))
-    return run.meta["seconds"]
+    return seconds
 
 
 def run_evaluate(args):

@@ -17,14 +17,14 @@ PEAK = 0.08  # m; how far from its best cell the end map's mean looks: on valida
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
 
 
-def predict(run, interactions, rows, depth_noise=0.0, seed=0):
+def predict(run, interactions, rows, depth_noise=0.0):
     """The whole model on some rows, its windows pasted into the whole picture.
 
     -> (whole Batch, Prediction, optical flow (B, H, W, 2) px, start heat-maps, end heat-maps). Outside the windows all
-    is background and stays. depth_noise: SD in m of the noise the model sees the depth with, drawn from `seed`.
+    is background and stays. depth_noise: SD in m of the noise the model sees the depth with, the same at every call.
     """
     camera = interactions.camera
-    batch, whole = (make_batch(interactions, rows, depth_noise=depth_noise, rng=np.random.default_rng([seed, rows[0]]),
+    batch, whole = (make_batch(interactions, rows, depth_noise=depth_noise, rng=np.random.default_rng([0, rows[0]]),
                                whole=whole) for whole in (False, True))
     prediction, flow, heatmaps = run_model(run.params, run.recipe.sizes, batch, camera)
     picture = (len(rows), camera.height, camera.width)

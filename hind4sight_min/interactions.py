@@ -198,6 +198,18 @@ def whole_file(path):
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path, text):
+    """Write a text file, whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text)
+
+
+def write_json(path, figures):
+    """Write plain JSON types, whole or not at all; nothing for no path."""
+    if path:
+        write_text(path, json.dumps(figures, indent=2, sort_keys=True) + "\n")
+
+
 def save_npz(path, arrays, meta):
     """Write arrays and one JSON text to a compressed .npz, whole or not at all."""
     with whole_file(path) as temporary, open(temporary, "wb") as file:

@@ -260,23 +260,23 @@ defvjp(pool, _pool_vjp, None, None)
 
 
 @primitive
-def weighted_means(x, weights, floor=1e-3):
-    """K weighted means of a cloud: sum_n w_nk x_n / (sum_n w_nk + floor).  x (B, N, C), weights (B, N, K) -> (B, K, C).
+def weighted_means(x, weights):
+    """K weighted means of a cloud: sum_n w_nk x_n / (sum_n w_nk + 1e-3).  x (B, N, C), weights (B, N, K) -> (B, K, C).
 
-    The floor keeps the mean under a mask that covers nothing finite, at 0.
+    The 1e-3 keeps the mean under a mask that covers nothing finite, at 0.
     """
-    return np.matmul(_shares(weights, floor)[0], x)
+    return np.matmul(_shares(weights)[0], x)
 
 
-def _shares(weights, floor):
+def _shares(weights):
     """The weights over their sum (B, K, N), and the sum (B, 1, K): as a product, np.sum is slow along this axis."""
-    total = np.matmul(np.ones((1, weights.shape[1]), weights.dtype), weights) + weights.dtype.type(floor)
+    total = np.matmul(np.ones((1, weights.shape[1]), weights.dtype), weights) + weights.dtype.type(1e-3)
     return np.swapaxes(weights / total, 1, 2), total
 
 
 def _weighted_means_vjp(argnums, ans, args, kwargs):
     x, weights = args
-    shares, total = _shares(weights, kwargs.get("floor", 1e-3))
+    shares, total = _shares(weights)
 
     def vjp(g):
         gradients = (lambda: np.matmul(np.swapaxes(shares, 1, 2), g),

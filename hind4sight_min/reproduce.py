@@ -4,7 +4,6 @@ Paper: Sec. IV, Tables I to III. Every cell of a table is a training run with a 
 finished cell leaves its figures in a file and is never run again. This file reads the simulator's truth.
 """
 import json
-import time
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from . import evaluation, simulator, training, worker_pool
-from .interactions import load_interactions, load_truth, whole_file
+from .interactions import load_interactions, load_truth, write_json
 from .objects import HELD_OUT
 
 
@@ -96,10 +95,9 @@ def recipe_of(cell, scale):
 
 def collect_data(out, scale, jobs, progress=None):
     """Training pokes, test pokes, and test pokes of objects and textures never trained on; completes what is there."""
-    unseen = replace(simulator.Settings(), kinds=HELD_OUT["kinds"], textures=HELD_OUT["textures"])
     for name, pokes, seed, settings in (("train", scale.train_pokes, 5, simulator.Settings()),
                                         ("test", scale.test_pokes, 101, simulator.Settings()),
-                                        ("unseen", scale.test_pokes, 102, unseen)):
+                                        ("unseen", scale.test_pokes, 102, simulator.Settings(**HELD_OUT))):
         simulator.collect(out / name, pokes, seed, settings, jobs, progress)
 
 
@@ -109,11 +107,6 @@ def _data(folder):
 
 
 # --- one cell ----------------------------------------------------------------------------------------------------
-
-def _write(path, value):
-    with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n")
-
 
 def run_cell(cell, out, scale, save_every=60.0):
     """Train and evaluate one cell, from where it was -> its metrics, with train_seconds. Runs in a worker process."""
@@ -125,29 +118,19 @@ def run_cell(cell, out, scale, save_every=60.0):
     run = training.load_run(path) if path.exists() else training.start_run(recipe, interactions)
     if run.recipe != recipe:
         raise ValueError(f"{path}: made with another recipe; remove it, or choose another --out")
-    before, start = run.meta.get("seconds", 0.0), time.perf_counter()
-    saved = [start]
-
-    def save(run, least=save_every):
-        if time.perf_counter() - saved[0] >= least:
-            saved[0] = time.perf_counter()
-            run.meta["seconds"] = before + saved[0] - start
-            training.save_run(path, run)
-
-    training.train(interactions, run, on_step=save, truth=truth if recipe.association else None)
-    save(run, least=0)
+    seconds = training.train_saving(interactions, run, path, save_every, truth=truth if recipe.association else None)
     metrics = evaluation.evaluate(run, *_data(out / "test"), depth_noise=recipe.depth_noise)
-    metrics["train_seconds"] = run.meta["seconds"]
+    metrics["train_seconds"] = seconds
     if cell.long and cell.noise == "clean":
         unseen = evaluation.evaluate(run, *_data(out / "unseen"))
         metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
-    _write(figures, metrics)
+    write_json(figures, metrics)
     return metrics
 
 
 # --- all of them ------------------------------------------------------------------------------------------------
 
-def reproduce(tables, out, scale, jobs=1, say=print, progress=None):
+def reproduce(tables, out, scale, jobs=1, progress=None):
     """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
     out = Path(out)
     described = {"train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes, "steps": scale.steps,
@@ -155,7 +138,7 @@ def reproduce(tables, out, scale, jobs=1, say=print, progress=None):
     note = out / "scale.json"
     if note.exists() and json.loads(note.read_text()) != described:
         raise ValueError(f"{out}: holds runs of another scale; choose another --out")
-    _write(note, described)
+    write_json(note, described)
     collect_data(out, scale, jobs, progress)
     cells, results = cells_of_tables(tables, scale), {}
     with worker_pool(jobs) as pool:
@@ -164,8 +147,8 @@ def reproduce(tables, out, scale, jobs=1, say=print, progress=None):
             for done in as_completed(waiting):
                 cell = waiting[done]
                 results[cell] = done.result()
-                say(f"{len(results)} of {len(cells)}: {cell.name}: ratio {results[cell]['flow_mse_ratio']:.3f}, "
-                    f"{results[cell]['train_seconds'] / 60:.1f} min")
+                print(f"{len(results)} of {len(cells)}: {cell.name}: ratio {results[cell]['flow_mse_ratio']:.3f}, "
+                      f"{results[cell]['train_seconds'] / 60:.1f} min")
         except BaseException:  # an interrupt must not wait for the cells that run: their checkpoints are on disk
             pool.shutdown(wait=False, cancel_futures=True)
             for process in active_children():

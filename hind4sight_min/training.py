@@ -3,6 +3,7 @@
 Only the supervised baseline, SE3-Nets (Recipe.association), is given the simulator's truth.
 """
 import math
+import time
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 
@@ -365,6 +366,31 @@ def save_run(path, run, resumable=True):
         arrays.update(first_moment=run.first_moment, second_moment=run.second_moment)
     save_npz(path, arrays, {"format": FORMAT, "recipe": asdict(run.recipe), "step": run.step, "sums": run.sums,
                             "log": run.log, "run": run.meta})
+
+
+def train_saving(interactions, run, path, save_every=60.0, on_step=None, **options):
+    """`train` with a checkpoint at `path` every `save_every` seconds and at the end; options are those of `train`.
+
+    Returns the seconds spent on the whole run, over all calls; they are kept in run.meta.
+    """
+    before, start = run.meta.get("seconds", 0.0), time.perf_counter()
+    saved = start
+
+    def save():
+        nonlocal saved
+        saved = time.perf_counter()
+        run.meta["seconds"] = before + saved - start
+        save_run(path, run)
+
+    def step_done(run):
+        if on_step:
+            on_step(run)
+        if time.perf_counter() - saved > save_every:
+            save()
+
+    train(interactions, run, on_step=step_done, **options)
+    save()
+    return run.meta["seconds"]
 
 
 def load_run(path):
