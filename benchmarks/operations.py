@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from race import fastest, race, ratios, report, serve
 
 from hind4sight_min import losses
+from hind4sight_min.figures import save_figure
 from hind4sight_min.interactions import write_json
-from hind4sight_min.interactions import whole_file
 
 CHAMFER = ("ours", "torch_1_threads", "torch_2_threads", "point_cloud_utils")
 WARP = ("ours", "torch_1_threads", "torch_2_threads", "scipy")
@@ -156,7 +156,7 @@ def measure(what, names, sizes, rounds, figures):
 
 def draw(path, operations, step):
     """The figure of docs/speed.md, from the recorded figures of this benchmark and of training_step.py."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = Figure(figsize=(11, 3.6), dpi=110, layout="constrained")
     axes = figure.subplots(1, 3)
     styles = {"ours": ("#0072B2", "o"), "torch_1_threads": ("#E69F00", "s"), "torch_2_threads": ("#D55E00", "s"),
               "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
@@ -184,8 +184,7 @@ def draw(path, operations, step):
     axes[2].set_yticks([30, 100, 300], labels=[30, 100, 300])
     axes[2].minorticks_off()
     axes[2].legend(fontsize=7)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    save_figure(figure, path)
 
 
 def main():

@@ -19,7 +19,7 @@ from hind4sight_min import evaluation, losses, training
 from hind4sight_min.__main__ import data_small
 from hind4sight_min.figures import _arrow, _blend, _show, flow_to_rgb, save_figure
 from hind4sight_min.geometry import optical_flow, project
-from hind4sight_min.interactions import load_interactions, load_truth, true_scene_flow, write_text
+from hind4sight_min.interactions import load_interactions, load_truth, write_text
 from hind4sight_min.objects import HELD_OUT
 from hind4sight_min.simulator import Settings, collect
 
@@ -107,20 +107,17 @@ def norms_table(runs, interactions):
 
 def predictions(run, interactions, truth):
     """For every poke that moved something: a dict of what is predicted, what is true, and how large the error is."""
-    camera = interactions.camera
     for first in range(0, len(interactions), 40):
         rows = np.arange(first, min(first + 40, len(interactions)))
         batch, prediction, flow, *_ = evaluation.predict(run, interactions, rows)
         for i, row in enumerate(rows):
-            true = true_scene_flow(batch.points[i], truth.labels[row].ravel(), truth.poses_before[row],
-                                   truth.poses_after[row])
-            moving = (np.linalg.norm(true, axis=1) > evaluation.MOVING) & batch.valid[i]
+            true, pixels, moving = evaluation.true_motion(interactions, truth, row)
             if moving.any():
                 yield {"row": row, "labels": moved_labels(truth, row), "masks": prediction.masks[i], "flow": flow[i],
                        "softness": 1 - prediction.masks[i][moving, 1:].sum(axis=1).mean(),
                        "error": ((prediction.points[i] - batch.points[i] - true)[moving] ** 2).sum(),
                        "motion": (true[moving] ** 2).sum(),
-                       "true": optical_flow(batch.points[i], batch.points[i] + true, camera)}
+                       "true": pixels}
 
 
 def draw(examples):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from .geometry import optical_flow, unproject
+from .geometry import optical_flow
 from .interactions import cell_centres, points_and_validity, true_scene_flow
 from .networks import windows
 from .ops import softmax
@@ -76,6 +76,18 @@ def matched_iou(masks, labels, moved):
     return result
 
 
+def true_motion(interactions, truth, row):
+    """What really happened in one interaction, from its depth without noise.
+
+    -> true scene flow (N, 3) m, true optical flow (N, 2) px, and which points have depth and move, (N,) bool.
+    """
+    points, valid = points_and_validity(interactions.depth_before[row], interactions.camera)
+    flow = true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
+    pixels = optical_flow(points, points + flow, interactions.camera)
+    moving = valid & (np.linalg.norm(flow, axis=2) > MOVING)
+    return flow.reshape(-1, 3), pixels.reshape(-1, 2), moving.ravel()
+
+
 def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     """All metrics on a data set -> flat dict of floats. depth_noise: SD in m of noise on the depth that the model sees.
 
@@ -87,7 +99,7 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     over all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a poke drawn from the
     set at random. Raises ValueError where nothing moved at all.
     """
-    settings, camera = interactions.meta["settings"], interactions.camera
+    settings = interactions.meta["settings"]
     sums = dict.fromkeys(("moving", "still", "squared", "motion", "error", "length", "drift", "optical",
                           "optical_zero", "optical_all", "optical_zero_all"), 0.0)
     ious, pokes, moved_rows = [], [], []
@@ -97,13 +109,10 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
         pokes.append(poke_from_heatmaps(start_heatmaps, end_heatmaps, settings))
         for i, row in enumerate(rows):
             labels = truth.labels[row].ravel()
-            points = unproject(interactions.depth_before[row], camera).reshape(-1, 3)  # where they are, without noise
-            true = true_scene_flow(points, labels, truth.poses_before[row], truth.poses_after[row])
+            true, true_pixels, moving = true_motion(interactions, truth, row)
             length = np.linalg.norm(true, axis=1)
-            moving = (length > MOVING) & batch.valid[i]
             still = batch.valid[i] & ~moving
             error = np.linalg.norm(prediction.points[i] - batch.points[i] - true, axis=1)
-            true_pixels = optical_flow(points, points + true, camera)
             pixel_error = np.linalg.norm(flow[i].reshape(-1, 2) - true_pixels, axis=1)
             pixel_length = np.linalg.norm(true_pixels, axis=1)
             for name, value in (("moving", moving.sum()), ("still", still.sum()),
@@ -193,15 +202,13 @@ def evaluate_image_pairs(interactions, truth):
     sums = {(peer, over): 0.0 for peer in PEERS for over in ("moving", "all")}
     count = {"moving": 0, "all": 0}
     for row in range(len(interactions)):
-        points, valid = points_and_validity(interactions.depth_before[row], interactions.camera)
-        true = true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
-        pixels = optical_flow(points, points + true, interactions.camera)
-        where = {"moving": valid & (np.linalg.norm(true, axis=2) > MOVING), "all": valid}
+        _, pixels, moving = true_motion(interactions, truth, row)
+        where = {"moving": moving, "all": (interactions.depth_before[row] > 0).ravel()}
         for over, mask in where.items():
             count[over] += int(mask.sum())
         for peer in PEERS:
             found = image_pair_flow(peer, interactions.rgb_before[row], interactions.rgb_after[row])
-            error = np.linalg.norm(found - pixels, axis=2)
+            error = np.linalg.norm(found.reshape(-1, 2) - pixels, axis=1)
             for over, mask in where.items():
                 sums[peer, over] += float(error[mask].sum())
     return {f"{peer}_optical_epe{'' if over == 'moving' else '_all'}_px": total / max(count[over], 1)
