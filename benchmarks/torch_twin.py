@@ -128,13 +128,19 @@ def forward_model(p, sizes, points, valid, pokes):
 def inverse_model(p, before, after, weights, cells):
     centre = (weights[..., None] * (before + after)).sum(dim=1) / 2
     centre = torch.cat([centre[:, :2], torch.zeros_like(centre[:, 2:])], dim=1)
-    x = torch.cat([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
+    amount = torch.log(weights[..., None] * weights.shape[1] + 1e-3) / 5
+    x = torch.cat([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]), amount,
                    encode(p, before), encode(p, after)], dim=2)
-    context = (weights[:, None] @ torch.relu(linear(p, "change", x)))[:, 0]
+    x = torch.relu(linear(p, "change_2", torch.relu(linear(p, "change_1", x))))
+    seen = weights > 1e-6 * weights.amax(dim=1, keepdim=True)
+    pooling = torch.stack([weights, weights ** 0.25, seen], dim=1)
+    pooling = pooling / (pooling.sum(dim=2, keepdim=True) + 1e-9)
+    context = torch.cat([(x * seen[..., None]).amax(dim=1), (pooling @ x).flatten(1)], dim=1)
+    bias = linear(p, "cell_context_2", torch.relu(linear(p, "cell_context_1", context)))
     local = (cells - centre[:, None, :2]).to(before.dtype)
     y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
-    y = torch.relu(linear(p, "cell_1", y))
-    y = torch.relu(y @ p["cell_2_w"] + linear(p, "cell_context", context)[:, None])
+    y = torch.relu(torch.relu(linear(p, "cell_1", y)) @ p["cell_2_w"] + bias[:, None])
+    y = torch.relu(linear(p, "cell_3", y))
     return linear(p, "heatmaps", y).unbind(-1)
 
 

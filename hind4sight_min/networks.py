@@ -18,16 +18,18 @@ from .ops import dense, pool, softmax, take, weighted_means
 class Sizes:
     """masks: K, background included. width: units of the layers that run on every point. rounds: of context.
     head: units of those that run once per scene or mask; they cost next to nothing.
-    embedding: length of the state embedding s_t and of the encoder's features.
+    embedding: length of the state embedding s_t and of the encoder's features. inverse: units of the inverse model.
     """
     masks: int = 4
     width: int = 48
     head: int = 128
     rounds: int = 2
     embedding: int = 32
+    inverse: int = 64
 
     def __post_init__(self):
-        for name, least in (("masks", 2), ("width", 1), ("head", 1), ("rounds", 1), ("embedding", 1)):
+        for name, least in (("masks", 2), ("width", 1), ("head", 1), ("rounds", 1), ("embedding", 1),
+                            ("inverse", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
 
@@ -62,6 +64,7 @@ def windows(pokes, camera):
     left = onp.clip(onp.rint(x - (columns - 1) / 2), 0, camera.width - columns).astype(int)
     top = onp.clip(onp.rint(y - (rows - 1) / 2), 0, camera.height - rows).astype(int)
     return [(slice(t, t + rows), slice(c, c + columns)) for t, c in zip(top, left)]
+
 
 def fourier(values, wavelengths):
     """sin and cos of 2 pi v / w: positions as a perceptron can use them. (..., D) -> (..., 2 D len(wavelengths))."""
@@ -141,7 +144,7 @@ def init_parameters(sizes, rng, dtype=onp.float32):
     Paper: Sec. III-G, "initializing one out of K masks to predict all pixels as background and moreover
     initializing SE(3) transformations to predict identity transform".
     """
-    params, width, head, embedding = {}, sizes.width, sizes.head, sizes.embedding
+    params, width, head, embedding, inverse = {}, sizes.width, sizes.head, sizes.embedding, sizes.inverse
 
     def add(name, inputs, outputs, gain=2.0):
         params[name + "_w"] = (rng.standard_normal((inputs, outputs)) * onp.sqrt(gain / inputs)).astype(dtype)
@@ -163,12 +166,15 @@ def init_parameters(sizes, rng, dtype=onp.float32):
     add("motion_3", head, 6, gain=0.0)
     add("next_1", embedding + 4 * width, width)
     add("next_2", width, embedding, gain=0.0)
-    add("change", 2 * 20 + 2 * embedding, width)
-    add("cell_1", 18, width)
-    add("cell_context", width, width, gain=1.0)  # its bias is the next layer's
-    add("cell_2", width, width)
+    add("change_1", 2 * 20 + 2 * embedding + 1, inverse)
+    add("change_2", inverse, inverse)
+    add("cell_context_1", 4 * inverse, inverse)
+    add("cell_context_2", inverse, inverse, gain=1.0)  # its bias is that of cell_2
+    add("cell_1", 18, inverse)
+    add("cell_2", inverse, inverse)
     del params["cell_2_b"]
-    add("heatmaps", width, 2, gain=0.1)
+    add("cell_3", inverse, inverse)
+    add("heatmaps", inverse, 2, gain=0.1)
     return params
 
 
@@ -283,18 +289,23 @@ def inverse_model(params, before, after, weights, cells):
     -> start logits, end logits, each (B, cells); softmax makes them heat-maps.
 
     Everything is said relative to the centre of change, so that a poke learnt in one corner of the arena is
-    known in all of them.
+    known in all of them. What changed is pooled by how much it changed, steeply, gently and not at all.
     """
     centre = onp.sum(weights[..., None] * (before + after), axis=1) / 2
     centre[:, 2] = 0
-    x = np.concatenate([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]),
+    amount = onp.log(weights[..., None] * weights.shape[1] + 1e-3) / 5
+    x = np.concatenate([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]), amount,
                         encode(params, before), encode(params, after)], axis=2)
-    x = layer(params, "change", x)
-    context = np.reshape(np.matmul(weights[:, None], x), (len(x), -1))  # (B, C): what changed, seen from its centre
+    x = layer(params, "change_2", layer(params, "change_1", x))
+    seen = weights > 1e-6 * weights.max(axis=1, keepdims=True)
+    pooling = onp.stack([weights, weights ** 0.25, seen], axis=1)  # by |P_{t+1} - P_t|^4, |P_{t+1} - P_t| and 1
+    pooling = pooling / (pooling.sum(axis=2, keepdims=True) + 1e-9)
+    context = pool(x, seen, pooling.astype(before.dtype))  # (B, 4 C): what changed, seen from its centre
+    bias = layer(params, "cell_context_2", layer(params, "cell_context_1", context), relu=False)
 
     local = (cells - centre[:, None, :2]).astype(before.dtype)  # (B, cells, 2)
     y = onp.concatenate([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], axis=2)
     y = layer(params, "cell_1", y)
-    y = dense(y, params["cell_2_w"], layer(params, "cell_context", context, relu=False), relu=True)
+    y = layer(params, "cell_3", dense(y, params["cell_2_w"], bias, relu=True))
     logits = layer(params, "heatmaps", y, relu=False)
     return take(logits, (..., 0)), take(logits, (..., 1))

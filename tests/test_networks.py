@@ -8,7 +8,7 @@ from hind4sight_min.networks import (Sizes, encoder_features, forward_model, fou
                                      inverse_model, most_changed, poke_axes, poke_features, poke_frame,
                                      pooling_weights, state_embedding, windows)
 
-SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6)
+SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6, inverse=9)
 
 
 def scene(rng, batch=2, count=40, dtype=np.float64):
@@ -139,7 +139,7 @@ def test_inverse_model_moves_with_the_change():
     after = before + 0.02 * rng.standard_normal(before.shape)
     weights = rng.dirichlet(np.ones(40), 2)
     params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
-    params["change_w"][40:] = 0  # what comes from the encoder is tied to the arena: switch it off
+    params["change_1_w"][41:] = 0  # what comes from the encoder is tied to the arena: switch it off
     first = inverse_model(params, before, after, weights, cells)
     shift = np.array([0.07, -0.03, 0])
     second = inverse_model(params, before + shift, after + shift, weights, cells + shift[:2])
@@ -247,7 +247,8 @@ def test_pooling_weights_look_at_the_target_and_along_the_path():
     assert path[2] == 0
 
 
-@pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("head", 0), ("rounds", 0), ("embedding", 0)])
+@pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("head", 0), ("rounds", 0), ("embedding", 0),
+                                         ("inverse", 0)])
 def test_impossible_sizes(name, value):
     with pytest.raises(ValueError, match=name):
         Sizes(**{name: value})
