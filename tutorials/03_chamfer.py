@@ -1,0 +1,205 @@
+"""The Chamfer distance: pulling one cloud onto another without knowing which point is which.
+
+Question: two point clouds show the same scene before and after a poke, and nobody says which point went where.
+What number tells us how well a predicted motion explains the second cloud, and does its gradient lead there?
+
+Equations:
+- Eq. (2), distance transforms and Chamfer distance: `losses.distance_maps`, `losses.chamfer_loss`, `ops.nearest_squared_distances`; tests/test_losses.py, tests/test_ops.py
+- Sec. IV-B, depth noise: `interactions.add_depth_noise`; tests/test_interactions.py
+
+Time: 4 s. Pictures: 03_maps.png, 03_gradient.png, 03_basin.png.
+
+Last lines to expect:
+   angle of the summed pull to the true motion [degrees]: expected below 15, got 1.542
+03_chamfer: all checks passed
+"""
+# %% [markdown]
+# Step through with the cells below, or run the whole file. `losses.distance_maps` is Eq. (2) as the package has it; with
+# your editor's "go to definition" it is one click away.
+
+# %%
+import autograd.numpy as anp
+import lesson
+import numpy as np
+from autograd import grad
+
+from hind4sight_min import evaluation, losses, ops
+from hind4sight_min.figures import PALETTE
+from hind4sight_min.interactions import add_depth_noise, occupied_pixels, points_and_validity
+
+options = lesson.begin(__file__)
+import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
+
+# %% [markdown]
+# ## Nearest neighbours by hand
+#
+# Write P' for the *predicted* cloud (the points of the first picture, moved by the model) and P for the *observed* one
+# (the points of the second picture). For every point of P' we look up the nearest point of P, and the other way round:
+#
+#     D_{P'->P}(i) = min_j |P'_i - P_j|^2        D_{P->P'}(j) = min_i |P'_i - P_j|^2
+#
+# One number per point, in square metres. Laid out on the pixels the points came from, each is a *distance map*. The sum of
+# both maps is the Chamfer distance, Eq. (2). Three points against two, small enough to check by eye:
+
+# %%
+predicted = np.array([[[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]]])  # (B=1, N=3, 3)
+observed = np.array([[[0.1, 0, 0], [1.0, 0.2, 0]]])              # (B=1, M=2, 3)
+to_observed = ops.nearest_squared_distances(predicted, observed, np.ones((1, 2), bool))
+to_predicted = ops.nearest_squared_distances(observed, predicted, np.ones((1, 3), bool))
+print("1. Three points against two")
+print("   predicted -> observed:", to_observed[0])   # 0.1^2, 0.2^2, 4^2 + 0.2^2
+print("   observed -> predicted:", to_predicted[0])  # 0.1^2, 0.2^2: nobody asks for the point at 5
+
+# %% [markdown]
+# Why both directions? The third predicted point is 4 m away from everything. Only the first map says so: every *observed*
+# point has a good partner without it. The other way round, an observed point that no predicted point explains shows only
+# in the second map. One direction alone can be cheated.
+#
+# ## Two real clouds
+#
+# Poke 1 of the test set pushes one object 6 cm over the table. Points without depth, and bits of table that the object
+# covers or uncovers, have no counterpart in the other cloud; `seen_in_both` leaves them out. The true motion comes from
+# the simulator: we use it here to see what the loss *should* like best. Training never reads it.
+
+# %%
+interactions, truth = lesson.pokes()
+ROW = 1
+camera, shape = interactions.camera, interactions.depth_before.shape[1:]
+
+
+def clouds(depth_before, depth_after):
+    """Two depth pictures (H, W) m -> two clouds (1, N, 3) m and which of their points have a counterpart (1, N)."""
+    depths = np.stack([depth_before, depth_after])
+    points, valid = points_and_validity(depths, camera)
+    occupied = occupied_pixels(depths, interactions.empty_depth)
+    before, after = points.reshape(2, 1, -1, 3)
+    return before, after, *losses.seen_in_both(*valid.reshape(2, 1, -1), *occupied.reshape(2, 1, -1))
+
+
+before, after, counted, next_counted = clouds(interactions.depth_before[ROW], interactions.depth_after[ROW])
+true_flow, _, moving = evaluation.true_motion(interactions, truth, ROW)  # (N, 3) m, and which points move
+still_maps = losses.distance_maps(before, after, counted, next_counted)
+true_maps = losses.distance_maps(before + true_flow, after, counted, next_counted)
+still, best = (float(losses.chamfer_loss(*maps)[0]) for maps in (still_maps, true_maps))
+print(f"2. Poke {ROW}: Chamfer distance without motion {1e4 * still:.1f} cm^2, along the true flow {1e4 * best:.1f} cm^2")
+
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
+titles = ("no motion: $D_{P' \\to P}$", "no motion: $D_{P \\to P'}$", "true flow: $D_{P' \\to P}$",
+          "true flow: $D_{P \\to P'}$")
+for panel, title, map_ in zip(axes, titles, (*still_maps, *true_maps)):
+    shown = panel.imshow(100 * np.sqrt(map_[0].reshape(shape)), cmap="viridis", vmin=0, vmax=4)
+    panel.set_title(title, fontsize=11)
+    panel.set_xticks([])
+    panel.set_yticks([])
+figure.colorbar(shown, ax=axes, label="$\\sqrt{D}$ [cm]", shrink=0.8)
+figure.suptitle("The distance maps light up where the object was and where it is, and go dark along the true flow",
+                fontsize=11)
+lesson.keep(options, figure, "maps")
+
+# %% [markdown]
+# ## Where does the gradient point?
+#
+# **Predict before you run:** start from no motion, P' = the first cloud. Minus the gradient of the Chamfer distance, taken
+# at each predicted point, is the direction in which the loss wants that point to go. Which points get an arrow at all?
+# Do the arrows on the object all point along the true motion?
+
+# %%
+def chamfer_of(cloud):
+    return anp.sum(losses.chamfer_loss(*losses.distance_maps(cloud, after, counted, next_counted)))
+
+
+pull = -grad(chamfer_of)(before)[0]  # (N, 3)
+on_object = moving & counted[0]
+length = np.linalg.norm(pull, axis=1)
+
+
+def angle(a, b):
+    """Angle between vectors (..., 3) as seen from above, in degrees."""
+    a, b = a[..., :2], b[..., :2]
+    cosine = np.sum(a * b, axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+single = angle(pull[on_object], true_flow[on_object])
+summed = angle(pull[on_object].sum(axis=0), true_flow[on_object].sum(axis=0))
+share = float((single < 60).mean())
+print(f"3. Of the arrows on the object, {share:.0%} are within 60 degrees of its true motion; their sum is off by "
+      f"{summed:.0f} degrees. Of the table's {np.sum(counted[0] & ~moving)} points {np.sum(length[~moving] > 1e-3)} "
+      "get an arrow.")
+
+figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", sharex=True, sharey=True)
+x, y = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
+for panel, arrows, title, colour in ((left, pull / 4, "minus the gradient of Eq. (2), a quarter as long", PALETTE[5]),
+                                     (right, true_flow, "the true scene flow", PALETTE[6])):
+    panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P'$", linewidths=0)
+    panel.scatter(*after[0, next_counted[0] & (after[0, :, 2] > 0.01), :2].T, s=16, marker="x", color=PALETTE[2],
+                  label="second cloud $P$, objects and walls only", linewidths=1)
+    panel.quiver(*before[0, on_object, :2].T, *arrows[on_object, :2].T, color=colour, angles="xy", scale_units="xy",
+                 scale=1, width=0.005)
+    panel.set(aspect="equal", xlim=(x - 0.13, x + 0.13), ylim=(y - 0.10, y + 0.10), xlabel="x [m]", ylabel="y [m]")
+    panel.set_title(title, fontsize=11)
+total = pull[on_object].mean(axis=0)
+left.quiver(x, y, *total[:2], color="black", angles="xy", scale_units="xy", scale=1, width=0.012, zorder=5,
+            label="their mean, true to length")
+left.legend(fontsize=8, loc="lower right")
+figure.suptitle("Seen from above: single points are pulled to the nearest edge; only the object as a whole is pulled right",
+                fontsize=11)
+lesson.keep(options, figure, "gradient")
+
+# %% [markdown]
+# Three lessons. Points that stay have themselves as nearest neighbour and get no arrow: the table is quiet by itself. A
+# single point is a bad guide: it is pulled to the nearest edge of the other cloud, and the few points nearest to the far
+# side collect the pull of all the observed points there (the long arrows). But *summed over the object*, the pull is
+# right. This is why the model moves whole masks rigidly (Eq. 1) and not points one by one: the mask does the summing.
+#
+# ## How far does the slope reach, and what does noise do to it?
+#
+# Move the object by 0 to 2 times its true motion and draw the Chamfer distance. Then add the paper's depth noise: a
+# standard deviation of 1 cm at every pixel, drawn anew for each picture. Now every table point finds a *spurious match*,
+# whatever the object does: noise lifts the whole curve. What matters is whether its minimum stays where it was.
+
+# %%
+rng = np.random.default_rng(0)
+scales = np.linspace(0, 2, 21)
+
+
+def curve(depth_before, depth_after):
+    """Chamfer distance in cm^2 with the object moved by every scale times its true motion."""
+    first, second, here, there = clouds(depth_before, depth_after)
+    return np.array([1e4 * losses.chamfer_loss(*losses.distance_maps(first + np.float32(scale) * true_flow, second, here,
+                                                                     there))[0] for scale in scales])
+
+
+depths = interactions.depth_before[ROW], interactions.depth_after[ROW]
+clean = curve(*depths)
+noisy = np.mean([curve(*(add_depth_noise(depth, rng, 0.01) for depth in depths)) for _ in range(5)], axis=0)
+print(f"4. Lowest at {scales[clean.argmin()]:.1f} times the true motion without noise, at {scales[noisy.argmin()]:.1f} "
+      f"with noise, which lifts the curve from {clean.min():.0f} to {noisy.min():.0f} cm^2")
+
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
+for panel, values, title, colour in ((axes[0], clean, "no noise", PALETTE[5]),
+                                     (axes[1], noisy, "1 cm depth noise, mean of 5 draws", PALETTE[6])):
+    panel.plot(scales, values, "o-", color=colour, markersize=4)
+    panel.axvline(1, color="0.5", linestyle=":", label="true motion")
+    panel.set(xlabel="object moved by this many times its true motion", ylabel="Chamfer distance [cm$^2$]")
+    panel.set_title(title, fontsize=11)
+    panel.legend(fontsize=9)
+figure.suptitle("One wide valley with its floor at the true motion; noise lifts it and leaves the floor in place",
+                fontsize=11)
+lesson.keep(options, figure, "basin")
+
+# %% [markdown]
+# **Now change this:** leave out `seen_in_both` (let `clouds` return `valid` twice instead). The table that the object
+# uncovers then counts too: where does the minimum of the curve go, and why would a network learn from that to drag the
+# table along? Then compare with docs/research-log.md, where the first checkpoint did just that.
+
+# %% Check
+print("5. Check")
+lesson.check("three points against two, predicted -> observed", float(to_observed.sum()), 0.01 + 0.04 + 16.04, within=1e-9)
+pairs = np.sum((before[0][:, None] - after[0][None, next_counted[0]]) ** 2, axis=2).min(axis=1)  # brute force
+lesson.check("largest difference to brute force [m^2]", float(np.abs(pairs * counted[0] - still_maps[0][0]).max()), below=1e-6)
+lesson.check("Chamfer along the true flow / without motion", best / still, above=0, below=0.3)
+lesson.check("scale at which the noise-free curve is lowest", float(scales[clean.argmin()]), 1.0, within=0.15)
+lesson.check("share of single arrows within 60 degrees of the true motion", share, above=0.3, below=0.9)
+lesson.check("angle of the summed pull to the true motion [degrees]", float(summed), below=15)
+print(f"{options.name}: all checks passed")

@@ -1,0 +1,61 @@
+"""What every tutorial needs: its data, a place for its pictures, and a closing check that can fail."""
+import argparse
+import sys
+from pathlib import Path
+
+import matplotlib
+
+from hind4sight_min.__main__ import data_small
+from hind4sight_min.interactions import load_interactions, load_truth, whole_file
+
+STEPPING = "ipykernel" in sys.modules  # in an editor, cell by cell: pictures appear there by themselves
+
+
+def begin(file):
+    """The options of a tutorial -> Namespace with out (Path), show and quick; `file` is the script's __file__."""
+    parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path(file).resolve().parent.parent / "runs" / "tutorials",
+                        help="folder for the pictures (runs/tutorials in the clone)")
+    parser.add_argument("--show", action="store_true", help="open a window for every picture")
+    parser.add_argument("--quick", action="store_true", help="a smaller budget: the same lesson in less time")
+    options = parser.parse_args([] if STEPPING else None)
+    if not (options.show or STEPPING):
+        matplotlib.use("Agg")
+    options.name = Path(file).stem
+    return options
+
+
+def keep(options, figure, name):
+    """Save a pyplot figure as OUT/NN_name.png and, with --show, open it."""
+    import matplotlib.pyplot as plt
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / f"{options.name[:2]}_{name}.png"
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
+    print(f"   picture: {path.name}")
+    if options.show:
+        plt.show()
+    if not STEPPING:
+        plt.close(figure)
+
+
+def pokes(part="test"):
+    """The shipped pokes, data_small/train or /test -> Interactions, Truth."""
+    folder = data_small() / part
+    return load_interactions(folder), load_truth(folder)
+
+
+def check(what, got, expected=None, *, within=None, above=None, below=None):
+    """Print what was expected and what came out, and stop if they differ.
+
+    Either `expected` to a tolerance `within`, or a bound: `above` or `below` (both: between them).
+    """
+    if expected is not None:
+        passed, wanted = abs(got - expected) <= within, f"{expected:.4g} within {within:g}"
+    else:
+        passed = (above is None or got > above) and (below is None or got < below)
+        wanted = " and ".join(f"{word} {value:g}" for word, value in (("above", above), ("below", below))
+                              if value is not None)
+    print(f"   {what}: expected {wanted}, got {got:.4g}")
+    assert passed, f"{what}: expected {wanted}, got {got:.4g}"
