@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from .geometry import Camera, unproject
@@ -161,6 +162,19 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     scale = standard_deviation / np.ma.filled(median, 1.0)
     noisy = depth * (1 + scale * rng.standard_normal(depth.shape))
     return np.where(valid, np.maximum(noisy, DEPTH_UNIT), 0).astype(depth.dtype)
+
+
+def smooth_depth(depth, empty_depth):
+    """Take noise out of depth pictures: a bilateral filter on the difference to the empty arena. Not in the paper.
+
+    In the difference the table is flat at 0 and objects are islands some cm high, so a filter that averages only
+    neighbours of like value, within 2.5 cm, halves noise of 1 cm and keeps most edges.
+    depth (..., H, W) m, 0 = missing, which stays; empty_depth (..., H, W) m, complete -> the same shape and dtype.
+    """
+    difference = np.where(depth > 0, depth - empty_depth, 0).astype(np.float32)
+    flat = difference.reshape(-1, *depth.shape[-2:])
+    smooth = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in flat]).reshape(depth.shape)
+    return np.where(depth > 0, empty_depth + smooth, 0).astype(depth.dtype)
 
 
 def associate_with_noise(depth, rng, window, threshold=0.10):

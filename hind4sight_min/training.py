@@ -15,7 +15,7 @@ from autograd.tracer import getval
 from . import losses, worker_pool
 from .geometry import free_radius, optical_flow, ray_spacing
 from .interactions import (add_depth_noise, associate_with_noise, cell_centres, cells_of, load_npz, occupied_pixels,
-                           points_and_validity, save_npz, true_scene_flow)
+                           points_and_validity, save_npz, smooth_depth, true_scene_flow)
 from .networks import (Sizes, encode, forward_model, init_parameters, inverse_model, most_changed, state_embedding,
                        windows)
 from .ops import take_block
@@ -52,7 +52,8 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
 
     mirror, a bool or one per row, shows the arena mirrored at its plane x = 0, which costs no new poke: pictures flip
     left-right, a_x changes sign, a_theta becomes pi - a_theta. This is exact for a camera that is symmetric about
-    that plane; ValueError for another. depth_noise: SD in m of Sec. IV-B's depth noise, drawn from `rng`.
+    that plane; ValueError for another. depth_noise: SD in m of Sec. IV-B's depth noise, drawn from `rng`;
+    a robot whose depth is noisy smooths it first.
     whole: the whole pictures instead of windows. truth (of these rows): adds the targets of SE3-Nets, with the
     association noise of Sec. IV-B, in which a point may be taken for any in an `association` px square around it.
     """
@@ -66,10 +67,10 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     depth[:, mirror], rgb[:, mirror] = depth[:, mirror, :, ::-1], rgb[:, mirror, :, ::-1]
     pokes[mirror] = pokes[mirror] * [-1, 1, -1] + [0, 0, onp.pi]
     starts[mirror] *= [-1, 1]
-    if depth_noise:
-        depth = add_depth_noise(depth, rng, depth_noise)
-    points, valid = points_and_validity(depth, camera)
     empty = onp.where(mirror[:, None, None], interactions.empty_depth[:, ::-1], interactions.empty_depth)
+    if depth_noise:
+        depth = smooth_depth(add_depth_noise(depth, rng, depth_noise), empty)
+    points, valid = points_and_validity(depth, camera)
     occupied = occupied_pixels(depth, empty)
     changed = most_changed(*points.reshape(2, len(rows), -1, 3), valid.all(axis=0).reshape(len(rows), -1))
     everything = [(slice(None), slice(None))] * len(rows)

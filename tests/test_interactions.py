@@ -13,7 +13,7 @@ from hind4sight_min.geometry import Camera, look_at, unproject
 from hind4sight_min.interactions import (DEPTH_UNIT, FORMAT, Interactions, Truth, add_depth_noise, associate_with_noise,
                                          cell_centres, cells_of, grid_shape, load_interactions, load_npz, load_shard,
                                          load_truth, occupied_pixels, points_and_validity, rotation_from_quaternion,
-                                         save_npz, save_shard, shards_in, true_scene_flow, truth_path)
+                                         save_npz, save_shard, shards_in, smooth_depth, true_scene_flow, truth_path)
 
 WIDTH, HEIGHT = 8, 6
 SETTINGS = {"arena": 0.5, "cell": 0.025}
@@ -707,3 +707,34 @@ def test_association_depends_on_the_seed_only():
 def test_association_refuses_even_and_empty_windows(window):
     with pytest.raises(ValueError, match=f"window.*{window}"):
         associate_with_noise(np.ones((4, 5)), np.random.default_rng(0), window)
+
+
+def test_smooth_depth_against_the_bilateral_sum():
+    rng = np.random.default_rng(2)
+    empty = np.float32(0.8) + np.linspace(0, 0.2, 12 * 16, dtype=np.float32).reshape(12, 16)
+    depth = empty - 0.04 * (rng.random((3, 12, 16)) < 0.3) + rng.normal(0, 0.01, (3, 12, 16))
+    difference = depth - empty
+    v, u = np.mgrid[-2:3, -2:3]
+    near = v ** 2 + u ** 2 <= 4  # the filter's neighbourhood is a disc
+    found = smooth_depth(depth, empty)
+    for i, row, column in ((0, 4, 5), (1, 7, 9), (2, 2, 13)):
+        patch = difference[i, row - 2:row + 3, column - 2:column + 3]
+        weights = near * np.exp(-(v ** 2 + u ** 2) / (2 * 1.5 ** 2)
+                                - (patch - difference[i, row, column]) ** 2 / (2 * 0.025 ** 2))
+        expected = empty[row, column] + (weights * patch).sum() / weights.sum()
+        assert abs(found[i, row, column] - expected) < 2e-5 < 1e-3 < abs(found[i, row, column] - depth[i, row, column])
+
+
+def test_smooth_depth_halves_noise_keeps_edges_missing_pixels_and_dtype():
+    rng = np.random.default_rng(3)
+    empty = np.full((2, 48, 64), 0.9, np.float32)
+    clean = empty.copy()
+    clean[:, 20:30, 20:30] -= 0.06
+    noisy = add_depth_noise(clean, rng, 0.01)
+    noisy[0, 5, 5] = 0
+    smooth = smooth_depth(noisy, empty)
+    assert smooth.dtype == np.float32 and smooth[0, 5, 5] == 0 and (smooth > 0).sum() == smooth.size - 1
+    rest = noisy > 0
+    assert (smooth - clean)[rest].std() < 0.5 * (noisy - clean)[rest].std()
+    edge = np.s_[:, 22:28, 20]  # the object's side columns do not flow out onto the table
+    assert np.abs(smooth[edge] - clean[edge]).mean() < 0.012
