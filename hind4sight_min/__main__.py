@@ -1,15 +1,15 @@
-"""The `hind4sight` command: collect, train, evaluate, show, demo, reproduce. `hind4sight COMMAND --help` says more."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce. `hind4sight COMMAND --help` says more."""
 import argparse
 import os
 import sys
 import sysconfig
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
-from . import evaluation, reproduce, simulator, training
+from . import control, evaluation, planning, reproduce, simulator, training
 from .geometry import project
 from .interactions import load_interactions, load_truth, write_json, write_text
 from .losses import distance_maps, warp_backward
@@ -181,13 +181,95 @@ def run_show(args):
     print(args.out)
 
 
+def run_reproduce_planning(args):
+    from . import figures
+    out = Path(args.out or "runs/planning")
+    found, curves = reproduce.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
+    print(reproduce.planning_table(found))
+    print(f"Obstacles avoided: planned {found['learned_obstacle_avoided']:.0%}, straight at the goal "
+          f"{found['greedy_obstacle_avoided']:.0%}")
+    figures.save_figure(figures.control_figure(curves, reproduce.POKES), out / "planning.png")
+    write_json(args.json or out / "figures.json", found)
+
+
 def run_reproduce(args):
+    if args.table == "planning":
+        return run_reproduce_planning(args)
     scale = reproduce.QUICK if args.quick else reproduce.FULL
     tables = list(reproduce.TABLES) if args.table == "all" else [args.table]
     out = Path(args.out or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
     figures = reproduce.reproduce(tables, out, scale, args.jobs, progress=progress_line("collect"))
     print(reproduce.tables_text(tables, figures))
     write_json(args.json or out / f"{args.table}.json", figures)
+
+
+def run_plan(args):
+    run = training.load_run(args.checkpoint)
+    weights = {} if args.chamfer_weight is None else {"chamfer_weight": args.chamfer_weight}
+    if (args.mark is None) != (args.goal is None):
+        raise ValueError("--mark, --goal: expected both or neither; --goal says where a marked point shall go")
+    own = args.click or args.mark is not None
+    if own:
+        weights = {"chamfer_weight": 0.0}  # there is no goal picture to compare with
+    search = planning.Search(candidates=args.candidates, horizon=args.horizon, iterations=args.iterations,
+                             pixel_weight=args.pixel_weight, **weights)
+    with control.random_task(args.seed, args.objects, args.obstacle) as task:
+        planning.check_camera(run, task.arena.camera)
+        if own:
+            marks, goals = click(task.arena.observe()[0]) if args.click else (args.mark, args.goal)
+            task = control.marked_task(task, marks, goals)
+        plan_and_show(run, task, args.policy, search, args.budget, Path(args.out),
+                      {"seed": args.seed, "movers": args.objects, "obstacle": args.obstacle})
+
+
+def plan_and_show(run, task, policy, search, budget, out, meta):
+    """The closed loop on a task: a line per poke, and into the folder `out` a record, the first plan's population, and an
+    animation.
+    """
+    from . import figures
+    camera, rounds, settings = task.arena.camera, [], asdict(task.arena.settings)
+    image = task.arena.observe()[0] / 255
+
+    def on_iteration(iteration, population, costs, mean, deviation):
+        if len(rounds) == iteration:  # of the first plan
+            targets = population[:, 0, :2]
+            back = np.stack([np.cos(population[:, 0, 2]), np.sin(population[:, 0, 2])], axis=1)
+            ends = np.stack([targets - settings["poke_length"][0] * back, targets])
+            rounds.append((*planning.places_on_table(ends, camera), costs))
+
+    record = control.closed_loop(task, run, policy, search, budget, meta["seed"], on_iteration)
+    distance, pokes = record["distance"].mean(axis=1), len(record["pokes"])
+    for t, poke in enumerate(record["pokes"]):
+        done = "" if np.isfinite(record["starts"][t]).all() else "  (no room for the finger: not carried out)"
+        print(f"  poke {t + 1} to ({poke[0]:6.3f}, {poke[1]:6.3f}) m, direction {np.degrees(poke[2]):4.0f} deg: "
+              f"{100 * distance[t]:5.1f} -> {100 * distance[t + 1]:5.1f} cm from the goals{done}")
+    ends = [planning.places_on_table(each, camera) for each in (record["starts"], record["pokes"][:, :2])]
+    marks = project(record["marks"], camera)
+    control.save_record(out / "plan.npz", record, {**meta, "policy": policy, "search": asdict(search)})
+    goal_rgb = record.get("goal_rgb")
+    figures.save_sequence(out / "plan.gif", record["rgb"] / 255, None if goal_rgb is None else goal_rgb / 255,
+                          np.stack(ends, axis=1), marks, record["goal_marks"], distance)
+    if rounds:
+        figures.save_figure(figures.population_figure(image, rounds, marks[0], record["goal_marks"]), out / "cem.png")
+    print(f"{out / 'plan.gif'}: {pokes} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
+    return record
+
+
+def click(image):
+    """Let the user click marks and goals in a window: a point on an object, then where it shall go, and so on; Enter ends.
+
+    -> marks, goals (M, 2) px. Raises ValueError for an odd number of clicks or none, RuntimeError without a display.
+    """
+    import matplotlib.pyplot as plt
+    if plt.get_backend().lower() == "agg":
+        raise RuntimeError("--click: there is no display to open a window on; give --mark and --goal in pixels instead")
+    plt.imshow(image)
+    plt.title("click a point on an object, then its goal; and so on; Enter ends")
+    points = np.array(plt.ginput(n=-1, timeout=0))
+    plt.close()
+    if len(points) == 0 or len(points) % 2:
+        raise ValueError(f"--click: expected pairs of clicks, a mark and its goal, got {len(points)}")
+    return points[::2], points[1::2]
 
 
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
@@ -213,8 +295,13 @@ def run_demo(args):
     motion = [np.abs(truth.poses_after[i] - truth.poses_before[i]).max() for i in range(len(test))]
     row = int(np.argsort(motion)[int(0.7 * len(motion))])  # a poke that moved something well, not the best one
     show_row(run, test, row, truth, out / "interaction.png")
+    print(f"{out / 'interaction.png'}\n5. Plan pokes to a goal with the model (CEM), carry them out, look again.")
+    with control.random_task(args.seed, 1) as task:
+        record = plan_and_show(run, task, "learned", planning.Search(), 6, out,
+                               {"seed": args.seed, "movers": 1, "obstacle": False})
+    metrics["plan_distance_left"] = record["distance"][-1].mean() / record["distance"][0].mean()
     seconds = time.perf_counter() - start
-    print(f"{out / 'interaction.png'}\nThe whole demo took {seconds:.0f} s.")
+    print(f"The whole demo took {seconds:.0f} s.")
     figures_found = {f"demo_{name}": value for name, value in metrics.items()}
     write_json(args.json or out / "metrics.json", {**figures_found, "demo_seconds": seconds})
 
@@ -287,9 +374,30 @@ def build_parser():
         else:
             sub.add_argument("--json", help="write the figures here too")
 
+    search = planning.Search()
+    sub = command("plan", run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)")
+    sub.add_argument("checkpoint", nargs="?", default=small / "checkpoint.npz")
+    sub.add_argument("--seed", type=int, default=0, help="which test scene")
+    sub.add_argument("--objects", type=int, default=1, choices=(1, 2, 3), help="how many are to be moved")
+    sub.add_argument("--obstacle", action="store_true", help="a scene with another object in the way")
+    sub.add_argument("--mark", type=float, nargs=2, action="append", metavar=("X", "Y"),
+                     help="a pixel on an object; repeat for more objects; with a --goal each, instead of the scene's goal")
+    sub.add_argument("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), help="where that shall go, a pixel")
+    sub.add_argument("--click", action="store_true", help="choose marks and goals in a window")
+    sub.add_argument("--policy", choices=control.POLICIES, default="learned")
+    sub.add_argument("--budget", type=int, default=10, help="pokes at most")
+    sub.add_argument("--candidates", type=int, default=search.candidates, help="CEM's population J")
+    sub.add_argument("--iterations", type=int, default=search.iterations)
+    sub.add_argument("--horizon", type=int, default=search.horizon, help="pokes planned ahead, H")
+    sub.add_argument("--pixel-weight", type=float, default=search.pixel_weight)
+    sub.add_argument("--chamfer-weight", type=float, help=f"{search.chamfer_weight}; 0 with goals of your own")
+    sub.add_argument("--out", default="runs/plan", help="folder for plan.gif, cem.png and the record plan.npz")
+
     sub = command("reproduce", run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it "
                   "can be stopped and started again (needs pybullet)")
-    sub.add_argument("table", choices=[*reproduce.TABLES, "all"])
+    sub.add_argument("table", choices=[*reproduce.TABLES, "all", "planning"],
+                     help="all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G")
+    sub.add_argument("--checkpoint", default=small / "checkpoint.npz", help="the model to plan with")
     sub.add_argument("--quick", action="store_true", help="the same tables from little data, in under ten minutes")
     sub.add_argument("--out", help="folder of data and runs (runs/reproduce, runs/reproduce-quick)")
     sub.add_argument("--jobs", type=int, default=os.cpu_count())

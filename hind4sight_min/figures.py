@@ -304,6 +304,122 @@ def training_figure(log):
     return figure
 
 
+# --- planning -------------------------------------------------------------------------------------------------------
+
+GOAL = PALETTE[4]
+
+
+def _draw_marks(axes, marks, goals):
+    """The marked points as rings, where they shall be as stars, and a line from one to the other."""
+    for mark, goal in zip(marks, goals):
+        axes.plot(*np.transpose([mark, goal]), ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)
+    axes.plot(*np.transpose(marks), "o", markersize=9, fillstyle="none", color=GOAL, markeredgewidth=2,
+              path_effects=OUTLINE, label="marked point")
+    axes.plot(*np.transpose(goals), "*", markersize=11, color=GOAL, markeredgecolor="black", label="its goal")
+
+
+def population_figure(image, rounds, marks, goals):
+    """How CEM's population converges: a panel per round, every candidate's first poke as a line on the picture.
+
+    Paper: Sec. III-H. image (H, W, 3) in [0, 1]. rounds: a list of (starts (J, 2) px, targets (J, 2) px, costs (J,)), of
+    which starts and costs may be NaN or infinite for pokes that cannot be. marks, goals (M, 2) px -> Figure.
+    """
+    image = _checked("image", image, None, None, 3, low=0, high=1)
+    if not rounds:
+        raise ValueError("rounds: expected at least one, got none")
+    marks, goals = _checked("marks", marks, None, 2), _checked("goals", goals, len(marks), 2)
+    finite = np.concatenate([np.asarray(costs)[np.isfinite(costs)] for *_, costs in rounds])
+    low, high = (finite.min(), np.quantile(finite, 0.9)) if len(finite) else (0, 1)
+    colours = colormaps["cividis"]
+    figure = Figure(figsize=(3.4 * len(rounds), 3.3), dpi=100, layout="constrained")
+    for i, (starts, targets, costs) in enumerate(rounds):
+        axes = figure.add_subplot(1, len(rounds), i + 1, label=f"round {i + 1}")
+        possible = np.flatnonzero(np.isfinite(costs))
+        _show(axes, 0.35 + 0.65 * image, f"Round {i + 1}: {len(possible)} of {len(costs)} possible\n"
+              f"lowest cost {np.min(costs):.2f}")
+        for j in possible[np.argsort(-np.asarray(costs)[possible])]:
+            shade = np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1)
+            axes.plot(*np.transpose([starts[j], targets[j]]), color=colours(1 - shade), linewidth=1.2)
+            axes.plot(*targets[j], ".", color=colours(1 - shade), markersize=5)
+        if len(possible):
+            best = int(np.argmin(costs))
+            _arrow(axes, starts[best], targets[best])
+        _draw_marks(axes, marks, goals)
+        axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+    figure.suptitle("CEM narrows its population down to one poke (yellow: cheap, blue: dear; arrow: the best)", fontsize=12)
+    return figure
+
+
+def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
+    """An animation of a planned sequence, written whole or not at all. Paper: Sec. IV-G, the figure of executed pokes.
+
+    images (T+1, H, W, 3) in [0, 1]; goal_image (H, W, 3) or None; arrows (T, 2, 2) px: start and target of each poke (NaN: it
+    could not be carried out); marks (T+1, M, 2) px; goals (M, 2) px; distances (T+1,) m: mean distance to the goals.
+    Raises ValueError for a path that does not end in .gif.
+    """
+    from matplotlib.animation import PillowWriter
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    path = Path(path)
+    if path.suffix.lower() != ".gif":
+        raise ValueError(f"path: expected a name ending in .gif, got {path.name!r}")
+    images = _checked("images", images, None, None, None, 3, low=0, high=1)
+    columns = 1 if goal_image is None else 2
+    figure = Figure(figsize=(4.2 * columns, 3.7), dpi=80)
+    figure.subplots_adjust(left=0.02, right=0.98, top=0.88, bottom=0.02, wspace=0.04)
+    FigureCanvasAgg(figure)
+    writer = PillowWriter(fps=1)
+    with whole_file(path) as temporary:
+        gif = Path(temporary).with_suffix(".gif")
+        with writer.saving(figure, str(gif), dpi=80):
+            for t, image in enumerate(images):
+                figure.clear()
+                axes = figure.add_subplot(1, columns, 1)
+                last = t == len(images) - 1
+                text = f"after {t} pokes: {100 * distances[t]:.1f} cm to go"
+                _show(axes, image, text + ("" if last else f"\nnext: poke {t + 1}"))
+                _draw_marks(axes, marks[t], goals)
+                if not last and np.isfinite(arrows[t]).all():
+                    _arrow(axes, *arrows[t])
+                axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+                if goal_image is not None:
+                    _show(figure.add_subplot(1, columns, 2), goal_image, "goal\n")
+                for _ in range(2 if last else 1):
+                    writer.grab_frame()
+        gif.replace(temporary)
+
+
+def control_figure(curves, pokes):
+    """Distance to the goals against the number of pokes: boxes over the scenes, one panel per number of objects to move.
+
+    Paper: Sec. IV-G, its box plot. curves: {(planner, objects): (scenes, pokes + 1) m}; "learned" is drawn as boxes, its
+    mean and those of all other planners as lines.
+    """
+    numbers = sorted({objects for _, objects in curves})
+    names = {"learned": "learned model, mean", "oracle": "the simulator as the model", "random": "random pokes",
+             "no_motion": "model of no motion"}
+    styles = {"learned": (PREDICTED, "-"), "oracle": (PALETTE[2], "--"), "random": (PALETTE[3], ":"),
+              "no_motion": ("0.4", "-.")}
+    figure = Figure(figsize=(11, 3.8), dpi=100, layout="constrained")
+    for i, objects in enumerate(numbers):
+        axes = figure.add_subplot(1, len(numbers), i + 1, label=f"objects {objects}")
+        for planner, (colour, line) in styles.items():
+            if (planner, objects) in curves:
+                distance = 100 * np.asarray(curves[planner, objects])
+                if planner == "learned":
+                    axes.boxplot(distance, positions=range(pokes + 1), widths=0.55, showfliers=True, flierprops={
+                        "marker": ".", "markersize": 4}, medianprops={"color": PREDICTED}, manage_ticks=False)
+                axes.plot(range(pokes + 1), distance.mean(axis=0), line, color=colour, linewidth=1.8, label=names[planner])
+        axes.set_title(f"{objects} object{'s' if objects > 1 else ''} to move", fontsize=11)
+        axes.set(xlabel="pokes", ylim=(0, None), xticks=range(0, pokes + 1, 2))
+        axes.grid(alpha=0.3, axis="y")
+    figure.axes[0].set_ylabel("mean distance to the goals [cm]", fontsize=10)
+    figure.axes[-1].legend(fontsize=8, loc="upper right")
+    figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
+    return figure
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
 def save_figure(figure, path):
     """Write a figure as PNG, whole or not at all; the same figure gives the same bytes, however often.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import evaluation, simulator, training, worker_pool
+from . import control, evaluation, planning, simulator, training, worker_pool
 from .interactions import load_interactions, load_truth, write_json
 from .objects import HELD_OUT
 
@@ -266,3 +266,109 @@ def tables_text(tables, figures):
             title = "flow MSE / no motion" + (", ablation" if table == "ablation" else "")
             parts.append(flow_table(figures, TABLES[table], title))
     return "\n\n".join(parts)
+
+
+# --- planning (Sec. IV-G) ------------------------------------------------------------------------------------------
+
+# name -> (what the table says, control.POLICIES, what its search changes)
+PLANNERS = {
+    "learned": ("learned model", "learned", {}),
+    "pixels": ("learned model, pixel distance alone", "learned", {"chamfer_weight": 0.0}),
+    "chamfer": ("learned model, Chamfer distance alone", "learned", {"pixel_weight": 0.0}),
+    "oracle": ("the simulator as the model", "oracle", {}),
+    "random": ("random pokes", "random", {}),
+    "no_motion": ("model of no motion", "no_motion", {}),
+}
+OBJECTS, POKES = (1, 2, 3), 10
+OBSTACLE_SCENES, OBSTACLE_TRIES = 3, 5
+AVOIDED = 0.01  # m; an obstacle that was moved by less was avoided
+
+
+def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
+    """One sequence of pokes, or its figures if it was run before; runs in a worker process.
+
+    planner: of PLANNERS, or "greedy"; movers 0: an obstacle scene.
+    """
+    path = out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json"
+    if path.exists():
+        return json.loads(path.read_text())
+    _, policy, changes = PLANNERS.get(planner, (None, planner, {}))
+    with control.random_task(seed, max(movers, 1), obstacle=movers == 0) as task:
+        record = control.closed_loop(task, training.load_run(checkpoint), policy, planning.Search(**changes), POKES,
+                                     seed=[seed, attempt])
+    others = np.setdiff1d(np.arange(record["poses"].shape[1]), record["movers"])
+    shifted = np.linalg.norm(record["poses"][:, others, :2] - record["poses"][0, others, :2], axis=2).max()
+    last = np.repeat(record["distance"][-1:], POKES + 1 - len(record["distance"]), axis=0)  # it stopped: all stays
+    distance = np.concatenate([record["distance"], last]).mean(axis=1)
+    angles = record["angle"][[0, -1]]
+    figures = {"distance_m": distance.tolist(), "others_shifted_m": float(shifted), "pokes": len(record["pokes"]),
+               "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist()}
+    write_json(path, figures)
+    return figures
+
+
+def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
+    """The paper's control experiment -> flat dict of figures, curves {(planner, objects): (scenes, pokes + 1) m}.
+
+    Scenes that were run before, with the same checkpoint, are not run again.
+    """
+    out = Path(out)
+    note, described = out / "planning.json", {"vector": float(np.abs(training.load_run(checkpoint).vector).sum())}
+    if note.exists() and json.loads(note.read_text()) != described:
+        raise ValueError(f"{out}: holds runs of another checkpoint; choose another --out")
+    write_json(note, described)
+    todo = [(planner, movers, seed, 0) for planner in PLANNERS for movers in OBJECTS for seed in range(scenes)]
+    todo += [(planner, 0, seed, attempt) for planner in ("learned", "greedy") for seed in range(OBSTACLE_SCENES)
+             for attempt in range(OBSTACLE_TRIES)]
+    with worker_pool(jobs) as pool:
+        try:
+            running = [pool.submit(run_scene, checkpoint, out, *each) for each in todo]
+            results = dict(zip(todo, (each.result() for each in running)))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+    curves = {(planner, movers): np.array([results[planner, movers, seed, 0]["distance_m"] for seed in range(scenes)])
+              for planner in PLANNERS for movers in OBJECTS}
+    return summarise_planning(results, curves), curves
+
+
+def summarise_planning(results, curves):
+    """Distance left after all pokes, relative to the start; orientation; obstacles -> flat dict of figures."""
+    figures = {}
+    for (planner, movers), curve in curves.items():
+        mean = curve.mean(axis=0)
+        figures[f"{planner}_{movers}_left"] = float(mean[-1] / mean[0])
+        figures[f"{planner}_{movers}_left_sd"] = float((curve[:, -1] / curve[:, 0]).std(ddof=1))
+        figures[f"{planner}_{movers}_left_after_5"] = float(mean[5] / mean[0])
+        figures[f"{planner}_{movers}_falls"] = float((np.diff(mean) <= 0).all())
+        turned = [each["angles_deg"] for key, each in results.items() if key[:2] == (planner, movers)]
+        before, after = (np.concatenate([pair[i] for pair in turned]) for i in (0, 1))
+        if len(before):
+            figures[f"{planner}_{movers}_angle_start_deg"] = float(np.median(before))
+            figures[f"{planner}_{movers}_angle_deg"] = float(np.median(after))
+    left = {planner: sum(curves[planner, movers][:, -1].mean() for movers in OBJECTS) for planner in PLANNERS}
+    figures["plan_over_oracle"] = float(left["learned"] / left["oracle"])
+    for movers in OBJECTS:
+        figures[f"plan_{movers}_object{'s' * (movers > 1)}"] = figures[f"learned_{movers}_left"]
+    for planner in ("learned", "greedy"):
+        runs = [each for key, each in results.items() if key[:2] == (planner, 0)]
+        figures[f"{planner}_obstacle_avoided"] = float(np.mean([each["others_shifted_m"] < AVOIDED for each in runs]))
+        figures[f"{planner}_obstacle_left"] = float(np.sum([each["distance_m"][-1] for each in runs])
+                                                    / np.sum([each["distance_m"][0] for each in runs]))
+    return figures
+
+
+def planning_table(figures):
+    """The control experiment as Markdown: distance left after all pokes, relative to the start; median orientation error."""
+    lines = ["| planner | " + " | ".join(f"{m} object{'s' * (m > 1)}: distance left | turned wrong by, start -> end"
+                                         for m in OBJECTS) + " |", "|---|" + "---|" * (2 * len(OBJECTS))]
+    for planner, (text, *_) in PLANNERS.items():
+        cells = []
+        for m in OBJECTS:
+            cells.append(_pm(figures, f"{planner}_{m}_left"))
+            angle = figures.get(f"{planner}_{m}_angle_deg")
+            cells.append("" if angle is None else f"{figures[f'{planner}_{m}_angle_start_deg']:.0f}\u00b0 -> {angle:.0f}\u00b0")
+        lines.append(f"| {text} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)

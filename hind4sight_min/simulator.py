@@ -107,7 +107,7 @@ class Arena:
         self.camera = arena_camera(settings.width, settings.height)
         self._plain_settings = asdict(settings)
         self.bullet_seconds = 0.0
-        self.bodies, self.pokes_in_scene = [], 0
+        self.bodies, self.kinds, self.radii, self.pokes_in_scene = [], [], [], 0
         self._client = pybullet.connect(pybullet.DIRECT)
         self._folder = tempfile.TemporaryDirectory()
         self._build()
@@ -183,7 +183,7 @@ class Arena:
             step(physicsClientId=client)
         self.bullet_seconds += time.perf_counter() - start
 
-    def _settle(self, limit=240):
+    def settle(self, limit=240):
         """Step until every object is at rest; False if one still moves after `limit` steps."""
         for _ in range(limit // 12):
             self._step(12)
@@ -204,7 +204,7 @@ class Arena:
         for _ in range(100):
             for body in self.bodies:
                 p.removeBody(body, physicsClientId=self._client)
-            self.bodies, placed = [], []
+            self.bodies, self.kinds, placed = [], [], []
             for _ in range(rng.integers(s.objects_min, s.objects_max + 1)):
                 kind = s.kinds[rng.integers(len(s.kinds))]
                 outlines, height, taper = KINDS[kind][0](rng)
@@ -214,9 +214,10 @@ class Arena:
                     if all(np.linalg.norm(xy - other) > radius + size + 0.004 for other, size in placed):
                         placed.append((xy, radius))
                         self.bodies.append(self._add_object(kind, outlines, height, taper, xy))
+                        self.kinds.append(kind)
                         break
-            self.pokes_in_scene = 0
-            if len(self.bodies) >= s.objects_min and self._settle():
+            self.pokes_in_scene, self.radii = 0, [size for _, size in placed]
+            if len(self.bodies) >= s.objects_min and self.settle():
                 return
         raise ValueError(f"objects: {s.objects_min} of them do not fit into {s.place_within:.0%} of a {s.arena} m arena")
 
@@ -255,6 +256,23 @@ class Arena:
             position, quaternion = self.bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
             result[i] = [*position, *quaternion]
         return result
+
+    def put(self, index, xy, turn=0.0):
+        """Lift object `index` over to xy (2,) m and turn it by `turn` rad about the vertical, upright as it stood."""
+        p, client = self.bullet, self._client
+        position, quaternion = p.getBasePositionAndOrientation(self.bodies[index], physicsClientId=client)
+        turned = p.multiplyTransforms([0, 0, 0], [0, 0, np.sin(turn / 2), np.cos(turn / 2)], [0, 0, 0], quaternion)[1]
+        p.resetBasePositionAndOrientation(self.bodies[index], [*xy, position[2] + 0.001], turned, physicsClientId=client)
+
+    def snapshot(self):
+        """The state of the world, for `restore`; forget it with `forget`."""
+        return self.bullet.saveState(physicsClientId=self._client)
+
+    def restore(self, state):
+        self.bullet.restoreState(state, physicsClientId=self._client)
+
+    def forget(self, state):
+        self.bullet.removeState(state, physicsClientId=self._client)
 
     # -- observations --
 
@@ -297,12 +315,12 @@ class Arena:
         distance = np.linalg.norm(centres - target, axis=1)
         starts = np.flatnonzero(free.ravel() & (distance >= s.poke_length[0]) & (distance <= s.poke_length[1]))
         for start in rng.permutation(starts):
-            if self._descent_is_free(*centres[start]):
+            if self.descent_is_free(*centres[start]):
                 dx, dy = target - centres[start]
                 return np.float32([*target, np.arctan2(dy, dx)]), np.float32(centres[start])
         return None
 
-    def _descent_is_free(self, x, y):
+    def descent_is_free(self, x, y):
         """The finger is a tall cylinder: lowered, it fills the whole column of its descent."""
         self._place_finger(x, y, 0)
         p, client = self.bullet, self._client
@@ -328,7 +346,7 @@ class Arena:
                                     force=s.finger_force, physicsClientId=self._client)
         self._step(int(length / s.finger_speed / self.TIME_STEP) + 40)  # the last 40 close the final centimetre
         self._place_finger(0, 0, PARK_HEIGHT)
-        return self._settle()
+        return self.settle()
 
 
 def occupied_cells(depth, empty_depth, camera, settings, threshold=OCCUPIED):

@@ -478,9 +478,9 @@ def test_objects_of_a_new_scene_stand_apart_from_each_other_and_from_the_walls()
 def test_settle_reports_what_still_falls():
     with make_arena(**single("carton", width=16, height=12)) as arena:
         arena.new_scene()
-        assert arena._settle()
+        assert arena.settle()
         put(arena, arena.bodies[0], 0, 0, 6.0)
-        assert not arena._settle()
+        assert not arena.settle()
 
 
 @needs_bullet
@@ -559,7 +559,7 @@ def test_the_finger_stalls_at_its_force_limit(mass, built):
         _, outlines, height, _ = built[body]
         put(arena, body, 0, 0, height / 2)
         arena.bullet.changeDynamics(body, -1, mass=mass, lateralFriction=0.7, physicsClientId=arena._client)
-        assert arena._settle()
+        assert arena.settle()
         before, track = arena.poses()[0], record_finger(arena)
         assert arena.poke(np.float32([0, 0, 0]), np.float32([-0.16, 0]))
         path, after = lowered(track), arena.poses()[0]
@@ -575,7 +575,7 @@ def test_it_is_the_force_limit_that_stalls_the_finger():
         arena.new_scene()
         put(arena, arena.bodies[0], 0, 0, arena.poses()[0, 2])
         arena.bullet.changeDynamics(arena.bodies[0], -1, mass=50, lateralFriction=0.7, physicsClientId=arena._client)
-        arena._settle()
+        arena.settle()
         before = arena.poses()[0]
         arena.poke(np.float32([0, 0, 0]), np.float32([-0.16, 0]))
         assert arena.poses()[0, 0] - before[0] > 0.03
@@ -694,7 +694,7 @@ def test_dropped_pokes_are_counted_and_not_kept(monkeypatch):
         moved_to = {"left_arena": (0.4, 0, 0.03), "out_of_view": (0, 0, 1.5), "not_at_rest": (0, 0, 7.0)}
         if current[0] in moved_to:
             put(self, self.bodies[0], *moved_to[current[0]])
-        return self._settle() if current[0] == "not_at_rest" else True
+        return self.settle() if current[0] == "not_at_rest" else True
 
     monkeypatch.setattr(Arena, "sample_poke", sample)
     monkeypatch.setattr(Arena, "poke", poke)

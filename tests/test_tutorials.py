@@ -1,0 +1,222 @@
+"""The tutorials keep their word: what they name is there, they run anywhere, and they notice what is broken.
+
+Every script runs twice in fresh processes, two at a time: as it is, and with an error planted in the package.
+"""
+import importlib
+import importlib.util
+import os
+import re
+import runpy
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parent.parent
+spec = importlib.util.spec_from_file_location("gallery", ROOT / "docs" / "gallery.py")
+gallery = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(gallery)
+SCRIPTS = {path.stem: path for path in sorted(gallery.TUTORIALS.glob("[0-9][0-9]_*.py"))}
+TIME_LIMIT = 120  # seconds per process, generous: another machine may be busy
+
+# script -> (module, function, what makes a wrong function of the right one)
+PLANTED = {
+    "03_chamfer": ("ops", "nearest_squared_distances",  # a distance, not squared
+                   lambda right: lambda *args: right(*args) ** 0.5),
+}
+
+
+def run_planted(stem, out):
+    """In a process of its own: put a wrong function into the package, then run a script."""
+    module, name, wrong = PLANTED[stem]
+    right = getattr(importlib.import_module(f"hind4sight_min.{module}"), name)
+    replacement = wrong(right)
+    for loaded in [each for each in sys.modules if each.startswith("hind4sight_min")]:
+        if getattr(sys.modules[loaded], name, None) is right:  # also where it was imported by name
+            setattr(sys.modules[loaded], name, replacement)
+    run_script(stem, out)
+
+
+def run_without_bullet(stem, out):
+    """In a process of its own: run a script where pybullet cannot be imported."""
+    sys.modules["pybullet"] = None
+    run_script(stem, out)
+
+
+def run_script(stem, out):
+    sys.argv = [str(SCRIPTS[stem]), "--quick", "--out", out]
+    sys.path[0] = str(SCRIPTS[stem].parent)
+    runpy.run_path(str(SCRIPTS[stem]), run_name="__main__")
+
+
+def command(test, stem, out):
+    """What a test wants to see run."""
+    if test == "test_it_runs_anywhere":
+        return ["-W", "error", str(SCRIPTS[stem]), "--quick", "--out", str(out)]
+    how = {"test_it_notices_a_planted_error": "run_planted", "test_it_runs_without_bullet": "run_without_bullet"}[test]
+    return ["-c", f"import test_tutorials; test_tutorials.{how}({stem!r}, {str(out)!r})"]
+
+
+def process(arguments, folder):
+    """Run Python away from the repository -> CompletedProcess, or None if it did not end in time."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]),
+                   "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=TIME_LIMIT,
+                              cwd=folder, env=environment)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+@pytest.fixture(scope="module")
+def started(request, tmp_path_factory):
+    """The processes of all tests that were chosen, two at a time -> {test: (its folder, future)}."""
+    with ThreadPoolExecutor(2) as pool:
+        futures = {}
+        for item in request.session.items:
+            if item.module is request.module and "done" in item.fixturenames:
+                folder = tmp_path_factory.mktemp("run")
+                (folder / "cwd").mkdir()
+                arguments = command(item.originalname, item.callspec.params["stem"], folder / "out")
+                futures[item.name] = folder, pool.submit(process, arguments, folder / "cwd")
+        yield futures
+        pool.shutdown(cancel_futures=True)
+
+
+@pytest.fixture
+def done(request, stem, started):
+    """This test's process, finished -> (CompletedProcess, folder of its pictures)."""
+    folder, future = started[request.node.name]
+    result = future.result()
+    assert result is not None, f"{stem}: time-out, it was still running after {TIME_LIMIT} s"
+    assert not list((folder / "cwd").iterdir()), f"{stem} wrote into the working directory"
+    return result, folder / "out"
+
+
+@pytest.mark.parametrize("stem", SCRIPTS)
+def test_it_has_all_parts(stem):
+    tutorial, source = gallery.parse(SCRIPTS[stem]), SCRIPTS[stem].read_text()
+    assert len(tutorial.pictures) >= 2
+    for part in ("**Predict before you run:**", "**Now change this:**"):
+        assert source.count(part) == 1, part
+    assert source.count("\n# %% Check\n") == 1 and "lesson.check(" in source.split("\n# %% Check\n")[1]
+    assert stem in PLANTED, "every tutorial needs a planted error that its checks notice"
+
+
+@pytest.mark.parametrize("stem", SCRIPTS)
+def test_what_it_names_is_in_the_tests_it_names(stem):
+    for what, functions, tests in gallery.parse(SCRIPTS[stem]).equations:
+        for function in functions:
+            word = re.compile(rf"\b{function.split('.')[-1]}\b")
+            assert any(word.search((ROOT / test).read_text()) for test in tests), (what, function, tests)
+
+
+@pytest.mark.parametrize("old, new, message", [
+    ("Question:", "Query:", "lacks its question"),
+    ("- Eq. (2)", "Eq. (2)", "lacks its equations"),
+    ("Time: 4 s.", "Time: short.", "lacks its time"),
+    ("Pictures:", "Figures:", "lacks its pictures"),
+    ("Last lines to expect:", "Last lines:", "lacks its lines"),
+    ("The Chamfer distance: ", "\nThe Chamfer distance: ", None),  # leading blank lines do no harm
+    ("; tests/test_losses.py", ", tests/test_losses.py", "expected '- what:"),
+    ("`losses.chamfer_loss`", "`losses.chamfer`", "no function losses.chamfer in"),
+    ("`losses.chamfer_loss`", "`loss.chamfer_loss`", "no function loss.chamfer_loss in"),
+    ("`losses.chamfer_loss`", "`losses`", "no function losses in"),
+    ("tests/test_ops.py", "tests/test_op.py", "no file tests/test_op.py"),
+    (", 03_gradient.png, 03_basin.png", "", "two or more pictures"),
+    ("03_gradient.png", "04_gradient.png", "two or more pictures"),
+    ("03_chamfer: all checks passed\n\"\"\"", "all checks passed\n\"\"\"", "expected the last line"),
+    ('"""', "'''", "lacks its title"),
+])
+def test_a_docstring_that_breaks_the_form_is_an_error_that_names_the_script(tmp_path, old, new, message):
+    source = SCRIPTS["03_chamfer"].read_text()
+    assert old in source
+    path = tmp_path / "03_chamfer.py"
+    path.write_text("0\n" + source if old == '"""' else source.replace(old, new, 1))
+    if message:
+        with pytest.raises(ValueError, match=f"^03_chamfer.py: .*{re.escape(message)}"):
+            gallery.parse(path)
+    else:
+        assert gallery.parse(path).title == gallery.parse(SCRIPTS["03_chamfer"]).title
+
+
+def test_the_gallery_says_what_the_scripts_say():
+    found = gallery.tutorials()
+    assert gallery.page(found) == gallery.PAGE.read_text(), "run `python docs/gallery.py --text`"
+    assert gallery.page(found[1:]) != gallery.page(found)
+    shown = {name for each in found for name in each.pictures[:gallery.SHOWN]}
+    assert shown == {path.name for path in gallery.PICTURES.iterdir()}, "run `python docs/gallery.py`"
+    assert sum(path.stat().st_size for path in gallery.PICTURES.iterdir()) < 1.2e6
+
+
+def test_the_gallery_links_to_what_exists():
+    targets = re.findall(r"\]\((.+?)\)", gallery.PAGE.read_text())
+    assert len(targets) > 6 * len(SCRIPTS)
+    for target in targets:
+        assert (gallery.PAGE.parent / target).exists(), target
+
+
+def assert_picture(path):
+    """A picture of plausible size with something in it; an animation has frames that differ."""
+    assert path.exists(), f"{path.name} was not made"
+    with Image.open(path) as picture:
+        assert picture.format == {".png": "PNG", ".gif": "GIF"}[path.suffix]
+        width, height = picture.size
+        frames = [np.asarray(picture.convert("L"))]
+        if path.suffix == ".gif":
+            picture.seek(picture.n_frames - 1)
+            frames.append(np.asarray(picture.convert("L")))
+            assert np.abs(frames[0].astype(int) - frames[1]).max() > 20, f"{path.name} does not move"
+    assert 500 <= width <= 1300 and 150 <= height <= 1300, f"{path.name}: {width} x {height}"
+    assert 4_000 < path.stat().st_size < 500_000, f"{path.name}: {path.stat().st_size} bytes"
+    assert all(len(np.unique(frame)) > 16 for frame in frames), f"{path.name} is as good as blank"
+
+
+def test_blank_pictures_are_noticed(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (300, 800), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "good.png")
+    assert_picture(tmp_path / "good.png")
+    Image.fromarray(np.where(noise > 128, np.uint8(255), np.uint8(0))).save(tmp_path / "blank.png")
+    for name in ("blank.png", "never.png"):
+        with pytest.raises(AssertionError, match=name):
+            assert_picture(tmp_path / name)
+
+
+@pytest.mark.parametrize("stem", SCRIPTS)
+def test_it_runs_anywhere(stem, done):
+    result, out = done
+    assert result.returncode == 0, f"{stem}:\n{result.stderr}"
+    assert result.stderr == ""
+    assert result.stdout.splitlines()[-1] == f"{stem}: all checks passed"
+    tutorial = gallery.parse(SCRIPTS[stem])
+    assert sorted(path.name for path in out.iterdir()) == sorted(tutorial.pictures)
+    for name in tutorial.pictures:
+        assert_picture(out / name)
+    if "options.quick" not in SCRIPTS[stem].read_text():  # with a smaller budget other lines may come
+        assert gallery.as_announced(tutorial, result.stdout), result.stdout
+        assert not gallery.as_announced(tutorial, result.stdout.replace(": expected", ": found"))
+
+
+@pytest.mark.parametrize("stem", SCRIPTS)
+def test_it_notices_a_planted_error(stem, done):
+    result, _ = done
+    assert result.returncode == 1, f"{stem} did not notice\n{result.stdout[-1000:]}\n{result.stderr}"
+    *_, last = result.stderr.splitlines()
+    assert last.startswith("AssertionError: "), f"{stem} failed in another way:\n{result.stderr}"
+    assert re.search(r'lesson\.py", line \d+, in check\n', result.stderr), result.stderr
+    check = last.removeprefix("AssertionError: ")  # named on stderr, and the last thing on stdout
+    assert ": expected " in check and result.stdout.splitlines()[-1].strip() == check
+
+
+@pytest.mark.parametrize("stem", [stem for stem in SCRIPTS if "simulator" in stem])
+def test_it_runs_without_bullet(stem, done):
+    result, out = done
+    assert result.returncode == 0, f"{stem}:\n{result.stderr}"
+    assert result.stdout.splitlines()[-1] == f"{stem}: all checks passed"
+    assert "pybullet" in result.stdout  # it says what is missing
+    for name in gallery.parse(SCRIPTS[stem]).pictures:
+        assert_picture(out / name)
