@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce. `hind4sight COMMAND --help` says more."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce; `hind4sight COMMAND --help`."""
 import argparse
 import os
 import sys
@@ -223,8 +223,8 @@ def run_plan(args):
 
 
 def plan_and_show(run, task, policy, search, budget, out, meta):
-    """The closed loop on a task: a line per poke, and into the folder `out` a record, the first plan's population, and an
-    animation.
+    """The closed loop on a task: a line per poke, and into the folder `out` a record, the first plan's population and
+    an animation.
     """
     from . import figures
     camera, rounds, settings = task.arena.camera, [], asdict(task.arena.settings)
@@ -256,7 +256,7 @@ def plan_and_show(run, task, policy, search, budget, out, meta):
 
 
 def click(image):
-    """Let the user click marks and goals in a window: a point on an object, then where it shall go, and so on; Enter ends.
+    """Let the user click in a window: a point on an object, then where it shall go, and so on; Enter ends.
 
     -> marks, goals (M, 2) px. Raises ValueError for an odd number of clicks or none, RuntimeError without a display.
     """
@@ -381,8 +381,8 @@ def build_parser():
     sub.add_argument("--objects", type=int, default=1, choices=(1, 2, 3), help="how many are to be moved")
     sub.add_argument("--obstacle", action="store_true", help="a scene with another object in the way")
     sub.add_argument("--mark", type=float, nargs=2, action="append", metavar=("X", "Y"),
-                     help="a pixel on an object; repeat for more objects; with a --goal each, instead of the scene's goal")
-    sub.add_argument("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), help="where that shall go, a pixel")
+                     help="a pixel on an object, again for each; with as many --goal, in place of the scene's")
+    sub.add_argument("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), help="where that shall go")
     sub.add_argument("--click", action="store_true", help="choose marks and goals in a window")
     sub.add_argument("--policy", choices=control.POLICIES, default="learned")
     sub.add_argument("--budget", type=int, default=10, help="pokes at most")

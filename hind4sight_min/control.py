@@ -112,7 +112,8 @@ def _set_goal(arena, movers, rng, opposite=None):
             return False
         places[i] = xy
         arena.put(i, xy, rng.uniform(-TURN, TURN))
-    return arena.settle() and np.abs(arena.poses()[:len(arena.bodies), :2] - [places[i] for i in sorted(places)]).max() < 0.01
+    wanted = [places[i] for i in sorted(places)]
+    return arena.settle() and np.abs(arena.poses()[:len(places), :2] - wanted).max() < 0.01
 
 
 def _mark(labels, depth, camera, index):
@@ -130,7 +131,7 @@ def _carried(points, movers, before, after):
     return (points + true_scene_flow(np.asarray(points, np.float64), labels, before, after)).astype(np.float32)
 
 
-# --- planners ---------------------------------------------------------------------------------------------------------
+# --- planners -------------------------------------------------------------------------------------------------------
 
 def oracle_rollout(arena, view, labels, settings):
     """The simulator as a rollout: every sequence is carried out, and undone. labels (N + M,): truth."""
@@ -171,7 +172,7 @@ def greedy_poke(view, goal, camera, settings, rng):
     return planning.draw_pokes(rng, 1, view, settings)[0]
 
 
-# --- the closed loop ---------------------------------------------------------------------------------------------------
+# --- the closed loop ------------------------------------------------------------------------------------------------
 
 def distances(poses, task):
     """How far the movers are from their goals: places in m, (M,), and orientations about the vertical in rad, (M,), NaN
@@ -216,7 +217,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
                 all_labels = np.concatenate([labels.ravel(), task.movers + 1])
                 rollout = oracle_rollout(arena, view, all_labels, settings)
             else:
-                step = planning.learned_step(run, camera, view.valid) if policy == "learned" else planning.no_motion_step
+                learned = planning.learned_step(run, camera, view.valid)
+                step = learned if policy == "learned" else planning.no_motion_step
                 rollout = lambda sequences: planning.roll(step, view, sequences, settings)  # noqa: E731
             found = planning.plan(rollout, view, goal, camera, settings, search, rng, on_iteration)
             if found.now < REACHED or found.cost > found.now - GAIN:
@@ -226,15 +228,15 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
         seconds.append(time.perf_counter() - began)
         moved, masks = planning.predict(run, camera, view.valid, view.cloud[None], poke[None])
         grid = planning.occupied_grid(view.cloud[None], view.occupied, settings)
-        room = [start for start in planning.possible_starts(poke[None], grid, settings)[0]
-                if np.isfinite(start).all() and arena.descent_is_free(*start)]
-        if room:
-            arena.poke(poke, room[0])
+        options = planning.possible_starts(poke[None], grid, settings)[0]
+        start = next((start for start in options[np.isfinite(options[:, 0])] if arena.descent_is_free(*start)), None)
+        if start is not None:
+            arena.poke(poke, start)
         pokes.append(poke)
-        starts.append(room[0] if room else np.full(2, np.nan))
+        starts.append(np.full(2, np.nan) if start is None else start)
         next_rgb, depth, labels = arena.observe()
         next_view = planning.view_of(depth, empty, camera, settings, marks)
-        if room:
+        if start is not None:
             marks = planning.follow(view, rgb, poke, moved[0], masks[0], next_view, next_rgb)
             next_view = planning.view_of(depth, empty, camera, settings, marks)
         rgb, view = next_rgb, next_view
@@ -257,15 +259,16 @@ def save_record(path, record, meta):
 
 
 def replay(path, settings=SETTINGS):
-    """Carry out the pokes of a saved record in a fresh arena -> poses (T+1, 7, 7), to be compared with the record's.
+    """Carry out the pokes of a saved record in a fresh arena -> poses (T+1, 7, 7), those of the record.
 
+    Bullet repeats itself to within some micrometres, unless objects collide with objects: that may amplify.
     Raises ValueError for a file that is no record.
     """
     record, meta = load_npz(path, FORMAT)
     with random_task(meta["seed"], meta["movers"], meta["obstacle"], settings) as task:
         poses = [task.arena.poses()]
         for poke, start in zip(record["pokes"], record["starts"]):
-            if np.isfinite(start).all():
+            if np.isfinite(start).all() and task.arena.descent_is_free(*start):
                 task.arena.poke(poke, start)
             poses.append(task.arena.poses())
     return np.stack(poses)

@@ -321,8 +321,9 @@ def _draw_marks(axes, marks, goals):
 def population_figure(image, rounds, marks, goals):
     """How CEM's population converges: a panel per round, every candidate's first poke as a line on the picture.
 
-    Paper: Sec. III-H. image (H, W, 3) in [0, 1]. rounds: a list of (starts (J, 2) px, targets (J, 2) px, costs (J,)), of
-    which starts and costs may be NaN or infinite for pokes that cannot be. marks, goals (M, 2) px -> Figure.
+    Paper: Sec. III-H. image (H, W, 3) in [0, 1]. rounds: a list of (starts (J, 2) px, targets (J, 2) px, costs (J,)),
+    the costs infinite for pokes that cannot be. marks, goals (M, 2) px -> Figure.
+    Raises ValueError for wrong shapes or no round.
     """
     image = _checked("image", image, None, None, 3, low=0, high=1)
     if not rounds:
@@ -346,15 +347,16 @@ def population_figure(image, rounds, marks, goals):
             _arrow(axes, starts[best], targets[best])
         _draw_marks(axes, marks, goals)
         axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    figure.suptitle("CEM narrows its population down to one poke (yellow: cheap, blue: dear; arrow: the best)", fontsize=12)
+    figure.suptitle("CEM narrows its population down to one poke (yellow: cheap, blue: dear; arrow: the best)",
+                    fontsize=12)
     return figure
 
 
 def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
     """An animation of a planned sequence, written whole or not at all. Paper: Sec. IV-G, the figure of executed pokes.
 
-    images (T+1, H, W, 3) in [0, 1]; goal_image (H, W, 3) or None; arrows (T, 2, 2) px: start and target of each poke (NaN: it
-    could not be carried out); marks (T+1, M, 2) px; goals (M, 2) px; distances (T+1,) m: mean distance to the goals.
+    images (T+1, H, W, 3) in [0, 1]; goal_image (H, W, 3) or None; arrows (T, 2, 2) px: start and target of each poke
+    (NaN: it could not be carried out); marks (T+1, M, 2) px; goals (M, 2) px; distances (T+1,) m: to the goals, mean.
     Raises ValueError for a path that does not end in .gif.
     """
     from matplotlib.animation import PillowWriter
@@ -389,10 +391,10 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
 
 
 def control_figure(curves, pokes):
-    """Distance to the goals against the number of pokes: boxes over the scenes, one panel per number of objects to move.
+    """Distance to the goals against the number of pokes: boxes over the scenes, a panel per number of objects to move.
 
-    Paper: Sec. IV-G, its box plot. curves: {(planner, objects): (scenes, pokes + 1) m}; "learned" is drawn as boxes, its
-    mean and those of all other planners as lines.
+    Paper: Sec. IV-G, its box plot. curves: {(planner, objects): (scenes, pokes + 1) m}; "learned" is drawn as boxes,
+    its mean and those of all other planners as lines.
     """
     numbers = sorted({objects for _, objects in curves})
     names = {"learned": "learned model, mean", "oracle": "the simulator as the model", "random": "random pokes",
@@ -408,7 +410,8 @@ def control_figure(curves, pokes):
                 if planner == "learned":
                     axes.boxplot(distance, positions=range(pokes + 1), widths=0.55, showfliers=True, flierprops={
                         "marker": ".", "markersize": 4}, medianprops={"color": PREDICTED}, manage_ticks=False)
-                axes.plot(range(pokes + 1), distance.mean(axis=0), line, color=colour, linewidth=1.8, label=names[planner])
+                axes.plot(range(pokes + 1), distance.mean(axis=0), line, color=colour, linewidth=1.8,
+                          label=names[planner])
         axes.set_title(f"{objects} object{'s' if objects > 1 else ''} to move", fontsize=11)
         axes.set(xlabel="pokes", ylim=(0, None), xticks=range(0, pokes + 1, 2))
         axes.grid(alpha=0.3, axis="y")

@@ -1,8 +1,8 @@
 """Plan pokes to a goal: rollouts, the cost of the paper, the cross entropy method. Paper: Sec. III-H and IV-G.
 
-A *cloud* here is a picture's points (H * W of them, row by row) and behind them the M points that the user marked, one per
-object. A *sequence* is H pokes, (H, 3). A *rollout* is any function that says where a cloud goes under sequences:
-sequences (J, H, 3) -> (clouds (J, H, N + M, 3) m after each poke, starts (J, H, 2) m, NaN where no finger fits). The learned
+A *cloud* here is a picture's N points, row by row, and behind them the M points that the user marked, one per object.
+A *sequence* is H pokes, (H, 3). A *rollout* is any function that says where a cloud goes under J sequences:
+(J, H, 3) -> clouds after each poke (J, H, N + M, 3) m, and starts (J, H, 2) m, NaN where no finger fits. The learned
 model is one, the simulator another (control.py), so that errors of the model and of the planner can be told apart.
 """
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .geometry import Camera, project, unproject
-from .interactions import OCCUPIED, cell_centres, cells_of, grid_shape, occupied_pixels
+from .interactions import cell_centres, cells_of, grid_shape, occupied_pixels
 from .networks import forward_model, window_shape, windows
 
 CHUNK = 16  # candidates per call of the network: more of them leave the processor's cache
@@ -31,8 +31,8 @@ class View:
 
 @dataclass(frozen=True)
 class Goal:
-    """pixels (M, 2): where the marked points shall be. points (G, 3) m: what stands in the arena in the goal picture, or
-    None where there is no such picture.
+    """pixels (M, 2): where the marked points shall be. points (G, 3) m: what stands in the arena in the goal picture,
+    or None where there is no such picture.
     """
     pixels: np.ndarray
     points: np.ndarray
@@ -42,9 +42,9 @@ class Goal:
 class Search:
     """The planner's budget and cost. candidates, elites, iterations, horizon: J, K, CEM's rounds, H.
 
-    pixel_weight: per px of the marked points' mean distance, as far as it exceeds SLACK. chamfer_weight: per cm of the
-    root of the scene's Chamfer distance (mean squared distance, both ways): about a pixel per pixel, so that neither term
-    drowns the other, far away or near. 0 leaves a term out.
+    pixel_weight: per px of the marked points' mean distance, as far as it exceeds SLACK. chamfer_weight: per cm of
+    the root of the scene's Chamfer distance (mean squared distance, both ways). A pixel is about a centimetre, so
+    neither term drowns the other, far away or near; without the root one would. 0 leaves a term out.
     """
     candidates: int = 64
     elites: int = 8
@@ -137,7 +137,7 @@ def places_on_table(places, camera):
 
 
 def goal_of(pixels, camera, settings, depth=None, empty_depth=None):
-    """A Goal from the pixels (M, 2) where the marked points shall be and, for the Chamfer term, the goal's depth picture.
+    """A Goal from the pixels (M, 2) where the marked points shall be and, for the Chamfer term, its depth picture.
 
     Raises ValueError for an empty goal scene.
     """
@@ -168,8 +168,8 @@ def possible_starts(pokes, grid, settings, lengths=5):
     """Where the finger may come down for each poke: pokes (J, 3), occupied cells (J, rows, columns) -> (J, L, 2) m.
 
     Training pokes came from free cells 10 to 14 cm behind an occupied target (simulator.Arena.sample_poke); so many
-    `lengths` of such paths are tried, the shortest first. NaN where the start is taken or outside the walls, and for pokes
-    whose target is not in the neighbourhood of an occupied cell.
+    `lengths` of such paths are tried, the shortest first. NaN where the start is taken or outside the walls, and for
+    pokes whose target is not in the neighbourhood of an occupied cell.
     """
     rows = np.arange(len(pokes))[:, None]
     taken = grown(grid).reshape(len(grid), -1)
@@ -333,8 +333,8 @@ def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None):
     """
     def cost(sequences):
         clouds, starts = rollout(sequences)
-        costs = np.mean([planning_cost(clouds[:, h], view, goal, camera, search) for h in range(search.horizon)], axis=0)
-        return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, costs)
+        steps = [planning_cost(after, view, goal, camera, search) for after in np.moveaxis(clouds, 1, 0)]
+        return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, np.mean(steps, axis=0))
 
     first = draw_pokes(rng, search.candidates, view, settings, search.horizon)
     pokes, lowest = cem(cost, first, rng, search, on_iteration)
@@ -352,8 +352,8 @@ def follow(view, rgb, poke, moved, masks, next_view, next_rgb):
     """Where the marked points are after a poke that the robot has carried out, (M, 3) m. Not in the paper.
 
     The model says which points belong to a mark's object (its mask) and where they went; iterated closest points, by
-    place and colour, in the plane of the table, correct that by what is seen. They start from the predicted motion and from
-    shifts by 0 to 6 cm along the poke, for it may go otherwise than predicted; the best fit counts.
+    place and colour, in the plane of the table, correct that by what is seen. They start from the predicted motion and
+    from shifts by 0 to 6 cm along the poke, for it may go otherwise than predicted; the best fit counts.
     view, next_view: Views before and after (the marks of next_view are not used); rgb, next_rgb (H, W, 3) uint8;
     poke (3,); moved (N + M, 3) m, masks (N + M,): `predict` for it.
     """
@@ -381,7 +381,7 @@ def follow(view, rgb, poke, moved, masks, next_view, next_rgb):
 
 
 def _register(points, where, colours, tree, rounds=15, kept=0.85):
-    """The planar motion of points (n, 3), at first guessed to go to `where`, that fits what `tree` holds best; the worst
+    """The planar motion of points (n, 3), at first guessed to go to `where`, that best fits those in `tree`; the worst
     sixth is left out as hidden -> (mean squared distance, rotation (2, 2), shift (2,)).
     """
     for _ in range(rounds):

@@ -361,7 +361,7 @@ def summarise_planning(results, curves):
 
 
 def planning_table(figures):
-    """The control experiment as Markdown: distance left after all pokes, relative to the start; median orientation error."""
+    """The control experiment as Markdown: distance left relative to the start, and median orientation error."""
     lines = ["| planner | " + " | ".join(f"{m} object{'s' * (m > 1)}: distance left | turned wrong by, start -> end"
                                          for m in OBJECTS) + " |", "|---|" + "---|" * (2 * len(OBJECTS))]
     for planner, (text, *_) in PLANNERS.items():
@@ -369,6 +369,7 @@ def planning_table(figures):
         for m in OBJECTS:
             cells.append(_pm(figures, f"{planner}_{m}_left"))
             angle = figures.get(f"{planner}_{m}_angle_deg")
-            cells.append("" if angle is None else f"{figures[f'{planner}_{m}_angle_start_deg']:.0f}\u00b0 -> {angle:.0f}\u00b0")
+            start = figures.get(f"{planner}_{m}_angle_start_deg")
+            cells.append("" if angle is None else f"{start:.0f}\u00b0 -> {angle:.0f}\u00b0")
         lines.append(f"| {text} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -219,7 +219,8 @@ class Arena:
             self.pokes_in_scene, self.radii = 0, [size for _, size in placed]
             if len(self.bodies) >= s.objects_min and self.settle():
                 return
-        raise ValueError(f"objects: {s.objects_min} of them do not fit into {s.place_within:.0%} of a {s.arena} m arena")
+        raise ValueError(f"objects: {s.objects_min} of them do not fit into {s.place_within:.0%} of a {s.arena} m "
+                         "arena")
 
     def _add_object(self, kind, outlines, height, taper, xy):
         p, rng, client = self.bullet, self.rng, self._client
@@ -262,7 +263,8 @@ class Arena:
         p, client = self.bullet, self._client
         position, quaternion = p.getBasePositionAndOrientation(self.bodies[index], physicsClientId=client)
         turned = p.multiplyTransforms([0, 0, 0], [0, 0, np.sin(turn / 2), np.cos(turn / 2)], [0, 0, 0], quaternion)[1]
-        p.resetBasePositionAndOrientation(self.bodies[index], [*xy, position[2] + 0.001], turned, physicsClientId=client)
+        p.resetBasePositionAndOrientation(self.bodies[index], [*xy, position[2] + 0.001], turned,
+                                          physicsClientId=client)
 
     def snapshot(self):
         """The state of the world, for `restore`; forget it with `forget`."""
