@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from hind4sight_min import figures
 from hind4sight_min.figures import (PALETTE, colour_wheel, flow_to_rgb, interaction_figure, save_figure,
                                     training_figure)
 
@@ -325,3 +326,64 @@ def test_only_png(tmp_path):
 def test_pyplot_is_not_imported():
     code = "import sys, hind4sight_min.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+# --- planning --------------------------------------------------------------------------------------------------------
+
+def rounds_of_cem(rng, count=8):
+    starts = rng.uniform(5, 15, (count, 2))
+    costs = np.where(np.arange(count) == 2, np.inf, rng.uniform(1, 5, count))
+    return starts, starts + [4.0, 2.0], costs
+
+
+def test_population_figure_has_a_panel_per_round_and_marks_the_best():
+    rng = np.random.default_rng(0)
+    rounds = [rounds_of_cem(rng) for _ in range(3)]
+    figure = figures.population_figure(np.full((20, 24, 3), 0.5), rounds, [[3.0, 4.0]], [[10.0, 12.0]])
+    assert [axes.get_label() for axes in figure.axes] == ["round 1", "round 2", "round 3"]
+    for axes, (starts, targets, costs) in zip(figure.axes, rounds):
+        assert "7 of 8 possible" in axes.get_title() and f"{costs.min():.2f}" in axes.get_title()
+        drawn = {tuple(np.round(line.get_xdata(), 6)) for line in axes.lines}
+        best = int(costs.argmin())
+        assert (round(starts[best, 0], 6), round(targets[best, 0], 6)) in drawn
+        assert (round(starts[2, 0], 6), round(targets[2, 0], 6)) not in drawn  # what cannot be is not drawn
+        (arrow,) = axes.patches
+        np.testing.assert_allclose(arrow._posA_posB, [starts[best], targets[best]])
+    with pytest.raises(ValueError, match="rounds"):
+        figures.population_figure(np.zeros((4, 4, 3)), [], [[1.0, 1.0]], [[1.0, 1.0]])
+    with pytest.raises(ValueError, match="goals"):
+        figures.population_figure(np.zeros((4, 4, 3)), rounds, [[1.0, 1.0]], np.zeros((2, 2)))
+
+
+def test_save_sequence_writes_a_frame_per_picture_or_nothing(tmp_path):
+    from PIL import Image
+    rng = np.random.default_rng(1)
+    images = rng.random((3, 12, 16, 3))
+    arrows = np.array([[[2.0, 3], [6, 7]], [[np.nan, np.nan], [6, 7]]])
+    figures.save_sequence(tmp_path / "plan.gif", images, images[0], arrows, np.full((3, 1, 2), 5.0), [[8.0, 8.0]],
+                          [0.1, 0.05, 0.01])
+    with Image.open(tmp_path / "plan.gif") as picture:
+        assert picture.n_frames >= 3
+        first = np.asarray(picture.convert("RGB"))
+        picture.seek(1)
+        assert (np.asarray(picture.convert("RGB")) != first).any()
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.gif"]
+    with pytest.raises(ValueError, match=".gif"):
+        figures.save_sequence(tmp_path / "plan.png", images, None, arrows, np.zeros((3, 1, 2)), [[8.0, 8.0]], [0, 0, 0])
+    with pytest.raises(ValueError, match="images"):
+        figures.save_sequence(tmp_path / "new.gif", 2 + images, None, arrows, np.zeros((3, 1, 2)), [[1.0, 1]], [0, 0, 0])
+    assert not (tmp_path / "new.gif").exists()
+
+
+def test_control_figure_draws_boxes_and_means():
+    rng = np.random.default_rng(2)
+    curves = {(planner, objects): rng.random((6, 4)) * 0.1 for planner in ("learned", "oracle") for objects in (1, 2)}
+    figure = figures.control_figure(curves, 3)
+    assert [axes.get_label() for axes in figure.axes] == ["objects 1", "objects 2"]
+    for axes, objects in zip(figure.axes, (1, 2)):
+        lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+        np.testing.assert_allclose(lines["learned model, mean"], 100 * curves["learned", objects].mean(axis=0))
+        np.testing.assert_allclose(lines["the simulator as the model"], 100 * curves["oracle", objects].mean(axis=0))
+        medians = [line.get_ydata()[0] for line in axes.lines if len(line.get_xdata()) == 2
+                   and line.get_color() is figures.PREDICTED and line.get_ydata()[0] == line.get_ydata()[1]]
+        np.testing.assert_allclose(medians, 100 * np.median(curves["learned", objects], axis=0))
