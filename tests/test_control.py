@@ -45,7 +45,8 @@ def test_marks_lie_on_the_movers_and_go_with_them():
             here, there = task.arena.poses()[mover], task.goal_poses[mover]
             assert np.linalg.norm(point[:2] - here[:2]) < 0.03
             there_mark = planning.places_at([goal_mark], [point[2]], task.arena.camera, settings)[0]
-            assert np.linalg.norm(there_mark - there[:2]) == pytest.approx(np.linalg.norm(point[:2] - here[:2]), abs=3e-3)
+            radius = np.linalg.norm(point[:2] - here[:2])
+            assert np.linalg.norm(there_mark - there[:2]) == pytest.approx(radius, abs=3e-3)
 
 
 def test_an_obstacle_stands_between_start_and_goal():
@@ -62,8 +63,9 @@ def test_distances_against_a_turn_by_hand():
         poses = task.goal_poses.copy()
         half = 0.3 / 2
         x, y, z, w = poses[mover, 3:]
+        # by 0.3 rad about z, from the left
         turn = [np.cos(half) * x - np.sin(half) * y, np.cos(half) * y + np.sin(half) * x,
-                np.cos(half) * z + np.sin(half) * w, np.cos(half) * w - np.sin(half) * z]  # by 0.3 about z, from the left
+                np.cos(half) * z + np.sin(half) * w, np.cos(half) * w - np.sin(half) * z]
         poses[mover] = [*(poses[mover, :2] + [0.03, -0.04]), poses[mover, 2], *turn]
         distance, angle = control.distances(poses, task)
         np.testing.assert_allclose(distance, 0.05, atol=1e-6)
@@ -139,12 +141,13 @@ def test_marks_and_goals_of_the_users_own():
         moved = project(point[None] + [[*shift, 0]], task.arena.camera)
         np.testing.assert_allclose(moved, [[32, 24]], atol=1e-3)
         for marks, goals, said in (([(0, 47)], [(32, 24)], "background"), ([mark], [(0, 47)], "outside the walls"),
-                                   ([mark], [(32, 99)], "outside the 64 x 48"), ([mark, mark], [(3, 3)], "one per mark")):
+                                   ([mark], [(32, 99)], "outside the 64 x 48"),
+                                   ([mark, mark], [(3, 3)], "one per mark")):
             with pytest.raises(ValueError, match=said):
                 control.marked_task(task, marks, goals)
 
 
-# --- the commands ----------------------------------------------------------------------------------------------------
+# --- the commands ---------------------------------------------------------------------------------------------
 
 def plan(*arguments):
     return main(["plan", *map(str, arguments), "--candidates", "16", "--iterations", "2", "--budget", "2"])
@@ -192,7 +195,7 @@ def test_clicks_are_pairs(monkeypatch):
         __main__.click(np.zeros((4, 4, 3)))
 
 
-# --- the control experiment --------------------------------------------------------------------------------------------
+# --- the control experiment -----------------------------------------------------------------------------------
 
 def test_a_scene_is_run_once(tmp_path):
     arguments = data_small() / "checkpoint.npz", tmp_path, "random", 1, 0
@@ -212,7 +215,8 @@ def test_summary_of_the_control_experiment_by_hand():
             results[planner, movers, 0, 0] = {"angles_deg": [[10.0, 20.0], [4.0, 8.0]]}
     for planner, shifts in (("learned", (0.0, 0.005, 0.05)), ("greedy", (0.02, 0.03, 0.0))):
         for seed, shift in enumerate(shifts):
-            results[planner, 0, seed, 0] = {"others_shifted_m": shift, "distance_m": [0.18, 0.09], "angles_deg": [[], []]}
+            results[planner, 0, seed, 0] = {"others_shifted_m": shift, "distance_m": [0.18, 0.09],
+                                              "angles_deg": [[], []]}
     figures = reproduce.summarise_planning(results, curves)
     assert figures["plan_1_object"] == figures["plan_2_objects"] == pytest.approx(0.15)
     assert figures["plan_over_oracle"] == pytest.approx(2)

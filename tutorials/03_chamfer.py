@@ -18,8 +18,9 @@ Last lines to expect:
 # your editor's "go to definition" it is one click away.
 
 # %%
+import lesson  # first of all: it sets the number of BLAS threads
+
 import autograd.numpy as anp
-import lesson
 import numpy as np
 from autograd import grad
 

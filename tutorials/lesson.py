@@ -3,10 +3,10 @@ import argparse
 import sys
 from pathlib import Path
 
-import matplotlib
-
-from hind4sight_min.__main__ import data_small
+from hind4sight_min.__main__ import data_small  # before NumPy and all that loads it: it sets the number of BLAS threads
 from hind4sight_min.interactions import load_interactions, load_truth, whole_file
+
+import matplotlib  # noqa: E402
 
 STEPPING = "ipykernel" in sys.modules  # in an editor, cell by cell: pictures appear there by themselves
 
@@ -27,13 +27,19 @@ def begin(file):
 
 
 def keep(options, figure, name):
-    """Save a pyplot figure as OUT/NN_name.png and, with --show, open it."""
+    """Save a figure as OUT/NN_name.png and, with --show, open it."""
     import matplotlib.pyplot as plt
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / f"{options.name[:2]}_{name}.png"
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
     print(f"   picture: {path.name}")
+    if not plt.fignum_exists(getattr(figure, "number", None)):  # one of the package's figures: pyplot shows its picture
+        if not (options.show or STEPPING):
+            return
+        figure = plt.figure(figsize=figure.get_size_inches(), layout="tight")
+        plt.imshow(plt.imread(path))
+        plt.axis("off")
     if options.show:
         plt.show()
     if not STEPPING:
