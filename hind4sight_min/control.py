@@ -6,6 +6,7 @@ Paper: Sec. IV-G. This file reads the simulator's truth to set goals and to meas
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 
@@ -185,6 +186,22 @@ def distances(poses, task):
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 
+def next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration=None):
+    """What a planner would do now -> planning.Plan; costs of NaN where it has none."""
+    arena, settings = task.arena, asdict(task.arena.settings)
+    if policy in ("random", "greedy"):
+        pokes = (planning.draw_pokes(rng, 1, view, settings)[0] if policy == "random"
+                 else greedy_poke(view, goal, arena.camera, settings, rng))
+        return planning.Plan(pokes, None, np.nan, np.nan)
+    if policy == "oracle":
+        rollout = oracle_rollout(arena, view, np.concatenate([labels.ravel(), task.movers + 1]), settings)
+    else:
+        learned = planning.learned_step(run, arena.camera, view.valid)
+        rollout = partial(planning.roll, learned if policy == "learned" else planning.no_motion_step, view,
+                          settings=settings)
+    return planning.plan(rollout, view, goal, arena.camera, settings, search, rng, on_iteration)
+
+
 def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None):
     """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent.
 
@@ -193,7 +210,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
     policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
     Of T pokes: rgb (T+1, H, W, 3), depth (T+1, H, W), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, pokes (T, 3),
     starts (T, 2) (NaN: the finger found no room), costs (T, 2): now and as planned, seconds (T,): of planning;
-    distance (T+1, M) m, angle (T+1, M) rad; and the goal. Raises ValueError for a checkpoint of another camera.
+    distance (T+1, M) m, angle (T+1, M) rad; and the goal. Raises ValueError for a checkpoint of another camera, and
+    planning.NoPoke where not even the first poke is possible; later on that ends the loop.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
@@ -208,23 +226,16 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
     pokes, starts, costs, seconds = [], [], [], []
     while len(pokes) < budget:
         began = time.perf_counter()
-        if policy in ("random", "greedy"):
-            poke = (planning.draw_pokes(rng, 1, view, settings)[0] if policy == "random"
-                    else greedy_poke(view, goal, camera, settings, rng))[0]
-            costs.append((np.nan, np.nan))
-        else:
-            if policy == "oracle":
-                all_labels = np.concatenate([labels.ravel(), task.movers + 1])
-                rollout = oracle_rollout(arena, view, all_labels, settings)
-            else:
-                learned = planning.learned_step(run, camera, view.valid)
-                step = learned if policy == "learned" else planning.no_motion_step
-                rollout = lambda sequences: planning.roll(step, view, sequences, settings)  # noqa: E731
-            found = planning.plan(rollout, view, goal, camera, settings, search, rng, on_iteration)
-            if found.now < REACHED or found.cost > found.now - GAIN:
-                break
-            poke = found.pokes[0]
-            costs.append((found.now, found.cost))
+        try:
+            found = next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration)
+        except planning.NoPoke:
+            if not pokes:
+                raise
+            break
+        if found.now < REACHED or found.cost > found.now - GAIN:
+            break
+        poke = found.pokes[0]
+        costs.append((found.now, found.cost))
         seconds.append(time.perf_counter() - began)
         moved, masks = planning.predict(run, camera, view.valid, view.cloud[None], poke[None])
         grid = planning.occupied_grid(view.cloud[None], view.occupied, settings)

@@ -100,6 +100,12 @@ def occupied_pixels(depth, empty_depth, threshold=OCCUPIED):
     return (depth > 0) & (empty_depth > 0) & (empty_depth - depth > threshold)
 
 
+def standing(depth, empty_depth, camera, settings, threshold=OCCUPIED):
+    """Which pixels show something that stands inside the walls, (..., H, W) bool: `occupied_pixels`, less the walls."""
+    inside = np.abs(unproject(depth, camera)[..., :2]).max(axis=-1) < settings["arena"] / 2
+    return inside & occupied_pixels(depth, empty_depth, threshold)
+
+
 def rotation_from_quaternion(quaternions):
     """Unit quaternions (..., 4), (x, y, z, w) as in Bullet -> rotation matrices (..., 3, 3)."""
     x, y, z, w = np.moveaxis(np.asarray(quaternions, float), -1, 0)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .geometry import Camera, project, unproject
-from .interactions import cell_centres, cells_of, grid_shape, occupied_pixels
+from .interactions import cell_centres, cells_of, grid_shape, standing
 from .networks import forward_model, window_shape, windows
 
 CHUNK = 16  # candidates per call of the network: more of them leave the processor's cache
@@ -64,6 +64,10 @@ class Search:
             raise ValueError(f"pixel_weight, chamfer_weight: expected numbers >= 0, not both 0, got {weights}")
 
 
+class NoPoke(ValueError):
+    """There is nothing to poke, or no room to."""
+
+
 def check_camera(run, camera):
     """Raise ValueError when a checkpoint was trained with another camera than this one."""
     trained = Camera(**{**run.meta["camera"], "arena_from_camera": np.array(run.meta["camera"]["arena_from_camera"])})
@@ -73,12 +77,6 @@ def check_camera(run, camera):
 
 
 # --- what the robot sees -------------------------------------------------------------------------------------
-
-def standing(depth, empty_depth, camera, settings):
-    """Which pixels show an object inside the walls, (H, W) bool: background subtraction, Sec. IV-A."""
-    inside = np.abs(unproject(depth, camera)[..., :2]).max(axis=-1) < settings["arena"] / 2
-    return occupied_pixels(depth, empty_depth) & inside
-
 
 def points_at(pixels, depth, empty_depth, camera, settings):
     """The points (M, 3) m, arena, that the user marked at pixels (M, 2), (x right, y down).
@@ -102,10 +100,10 @@ def points_at(pixels, depth, empty_depth, camera, settings):
 
 
 def view_of(depth, empty_depth, camera, settings, marks):
-    """A View of a depth picture (H, W) m and the marked points (M, 3) m. Raises ValueError where no object stands."""
+    """A View of a depth picture (H, W) m and the marked points (M, 3) m. Raises NoPoke where no object stands."""
     objects = standing(depth, empty_depth, camera, settings).ravel()
     if not objects.any():
-        raise ValueError("scene: no object stands in the arena")
+        raise NoPoke("scene: no object stands in the arena")
     points, on = unproject(depth, camera).reshape(-1, 3), np.ones(len(marks), bool)
     return View(np.concatenate([points, marks]).astype(np.float32), np.concatenate([depth.ravel() > 0, on]),
                 np.concatenate([objects, on]), len(marks))
@@ -191,7 +189,7 @@ def first_start(starts):
 def draw_pokes(rng, count, view, settings, horizon=1):
     """Sequences (count, H, 3) as the training pokes were drawn: somewhere on what stands in the arena, from anywhere.
 
-    Those whose first poke has no free start are drawn again. Raises ValueError where there is hardly one that has.
+    Those whose first poke has no free start are drawn again. Raises NoPoke where there is hardly one that has.
     """
     grid = occupied_grid(view.cloud[None], view.occupied, settings)
     targets, result = cell_centres(settings)[np.flatnonzero(grid[0])], []
@@ -203,7 +201,7 @@ def draw_pokes(rng, count, view, settings, horizon=1):
         result.extend(drawn[np.isfinite(starts[..., 0]).any(axis=1)])
         if len(result) >= count:
             return np.stack(result[:count])
-    raise ValueError("scene: there is no room for the finger to come down behind any object")
+    raise NoPoke("scene: there is no room for the finger to come down behind any object")
 
 
 # --- rollouts -----------------------------------------------------------------------------------------------------
@@ -296,7 +294,7 @@ def cem(cost, population, rng, search, on_iteration=None):
 
     cost: sequences (J, H, 3) -> (J,), NaN or infinity for those that cannot be. population (J, H, 3): the first one.
     on_iteration(iteration, population, costs, mean, deviation) is called after every round with the refitted Gaussian.
-    -> the best sequence ever seen (H, 3) and its cost; ValueError if none had a finite one.
+    -> the best sequence ever seen (H, 3) and its cost; NoPoke if none had a finite one.
     """
     best, lowest = None, np.inf
     for iteration in range(search.iterations):
@@ -307,7 +305,7 @@ def cem(cost, population, rng, search, on_iteration=None):
             best, lowest = population[order[0]].copy(), float(costs[order[0]])
         elites = population[[j for j in order[:search.elites] if costs[j] < np.inf]]
         if best is None:
-            raise ValueError("plan: no candidate poke is possible")
+            raise NoPoke("plan: no candidate poke is possible")
         mean, deviation = refit(elites if len(elites) else best[None])
         if on_iteration:
             on_iteration(iteration, population, costs, mean, deviation)

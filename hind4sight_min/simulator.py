@@ -16,7 +16,7 @@ import numpy as np
 from . import worker_pool
 from .geometry import Camera, look_at, unproject
 from .interactions import (OCCUPIED, Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
-                           occupied_pixels, save_shard, truth_path)
+                           save_shard, standing, truth_path)
 from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
 
 MAX_OBJECTS = 7
@@ -356,11 +356,9 @@ def occupied_cells(depth, empty_depth, camera, settings, threshold=OCCUPIED):
 
     depth, empty_depth (H, W) m; threshold: of `occupied_pixels`, m -> (rows, columns) bool.
     """
-    points = unproject(depth, camera)
-    inside = np.abs(points[..., :2]).max(axis=-1) < settings["arena"] / 2
-    changed = inside & occupied_pixels(depth, empty_depth, threshold)
+    changed = standing(depth, empty_depth, camera, settings, threshold)
     occupied = np.zeros(grid_shape(settings), bool)
-    occupied.ravel()[cells_of(points[changed][:, :2], settings)] = True
+    occupied.ravel()[cells_of(unproject(depth, camera)[changed][:, :2], settings)] = True
     return occupied
 
 

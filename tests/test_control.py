@@ -129,6 +129,22 @@ def test_the_other_planners(policy, run):
         assert abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.radians(60)
 
 
+def test_no_poke_left_ends_the_loop_and_loses_nothing(run, monkeypatch):
+    next_poke, calls = control.next_poke, []
+
+    def once(*arguments):
+        calls.append(arguments)
+        if len(calls) > 1:
+            raise planning.NoPoke("no room")
+        return next_poke(*arguments)
+    monkeypatch.setattr(control, "next_poke", once)
+    with control.random_task(2, 1) as task:
+        record = control.closed_loop(task, run, "random", SMALL, budget=5)
+        assert len(record["pokes"]) == 1 and len(record["poses"]) == 2
+        with pytest.raises(planning.NoPoke):
+            control.closed_loop(task, run, "random", SMALL, budget=5)
+
+
 def test_marks_and_goals_of_the_users_own():
     with control.random_task(4, 1) as task:
         mark, settings = task.marks[0], asdict(task.arena.settings)
