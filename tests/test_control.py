@@ -140,7 +140,8 @@ def test_no_poke_left_ends_the_loop_and_loses_nothing(run, monkeypatch):
     monkeypatch.setattr(control, "next_poke", once)
     with control.random_task(2, 1) as task:
         record = control.closed_loop(task, run, "random", SMALL, budget=5)
-        assert len(record["pokes"]) == 1 and len(record["poses"]) == 2
+    assert len(record["pokes"]) == 1 and len(record["poses"]) == 2
+    with control.random_task(2, 1) as task:
         with pytest.raises(planning.NoPoke):
             control.closed_loop(task, run, "random", SMALL, budget=5)
 
