@@ -125,10 +125,10 @@ def parse(path):
     pictures = re.split(r",\s+", parts["pictures"].strip().removesuffix("."))
     if len(pictures) < 2 or not all(re.fullmatch(path.name[:2] + r"_\w+\.(png|gif)", name) for name in pictures):
         raise ValueError(f"{path.name}: expected two or more pictures {path.name[:2]}_*.png, got {pictures}")
-    lines = parts["lines"].splitlines()
+    lines, question = parts["lines"].splitlines(), " ".join(parts["question"].split())
     if lines[-1] != f"{path.stem}: all checks passed":
         raise ValueError(f"{path.name}: expected the last line '{path.stem}: all checks passed', got {lines[-1]!r}")
-    return Tutorial(path, parts["title"].rstrip("."), " ".join(parts["question"].split()), equations, parts["time"],
+    return Tutorial(path, parts["title"].rstrip("."), question[0].upper() + question[1:], equations, parts["time"],
                     pictures, lines)
 
 

@@ -299,7 +299,7 @@ def run_demo(args):
     with control.random_task(args.seed, 1) as task:
         record = plan_and_show(run, task, "learned", planning.Search(), 6, out,
                                {"seed": args.seed, "movers": 1, "obstacle": False})
-    metrics["plan_distance_left"] = record["distance"][-1].mean() / record["distance"][0].mean()
+    metrics["plan_distance_left"] = float(record["distance"][-1].mean() / record["distance"][0].mean())
     seconds = time.perf_counter() - start
     print(f"The whole demo took {seconds:.0f} s.")
     figures_found = {f"demo_{name}": value for name, value in metrics.items()}

@@ -23,7 +23,7 @@ spec = importlib.util.spec_from_file_location("gallery", ROOT / "docs" / "galler
 gallery = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(gallery)
 SCRIPTS = {path.stem: path for path in sorted(gallery.TUTORIALS.glob("[0-9][0-9]_*.py"))}
-TIME_LIMIT = 120  # seconds per process, generous: another machine may be busy
+TIME_LIMIT = 180  # seconds per process, generous: another machine may be busy
 
 # script -> (module, function, what makes a wrong function of the right one)
 PLANTED = {
