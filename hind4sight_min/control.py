@@ -17,6 +17,7 @@ from .simulator import Arena, Settings
 
 FORMAT = "hind4sight_min plan 1"
 SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
+IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 REACHED = 0.4  # cost below which the goal counts as reached: less than followed marks and pixels can tell
 GAIN = 0.05  # of the cost; a poke that is predicted to bring less is not worth its risk
@@ -28,13 +29,15 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
 @dataclass
 class Task:
-    """A scene in its arena and a goal. movers: which objects are to move, indices. marks (M, 2) px: a point on each.
+    """A scene in its arena and a goal. movers: which objects are to move, indices, to measure by.
 
+    marked (M,): the objects that a point is marked on, those and perhaps others that shall stay. marks (M, 2) px.
     goal_marks (M, 2) px: the same points in the goal picture. goal_poses (7, 7): as Arena.poses; truth, to measure by.
     goal: (rgb, depth) of the goal, or None where the user only said where the marks shall go.
     """
     arena: Arena
     movers: np.ndarray
+    marked: np.ndarray
     marks: np.ndarray
     goal_marks: np.ndarray
     goal_poses: np.ndarray
@@ -45,8 +48,8 @@ class Task:
 def random_task(seed, movers, obstacle=False, settings=SETTINGS):
     """The fixed test task of a seed: three or four objects, `movers` of them to be moved by 8 to 14 cm and turned.
 
-    obstacle: one object to be moved by 18 cm, with another one half-way. Draws scenes until the goal is one that the
-    objects can be in: apart from each other, in sight, inside the walls.
+    obstacle: one object to be moved by 18 cm, and another one half-way, across half of it, that is marked to stay.
+    Draws scenes until the goal is one that the objects can be in: apart from each other, in sight, inside the walls.
     """
     rng = np.random.default_rng([seed, movers, obstacle])
     with Arena(settings, rng) as arena:
@@ -62,10 +65,11 @@ def random_task(seed, movers, obstacle=False, settings=SETTINGS):
                 _, depth_now, labels_now = arena.observe()
                 seen = [min(np.sum(labels == i + 1), np.sum(labels_now == i + 1)) for i in range(len(arena.bodies))]
                 if min(seen) >= 12:
-                    marks = np.array([_mark(labels_now, depth_now, arena.camera, i) for i in chosen])
+                    marked = np.append(chosen, 1) if obstacle else chosen
+                    marks = np.array([_mark(labels_now, depth_now, arena.camera, i) for i in marked])
                     points = unproject(depth_now, arena.camera)[marks[:, 1], marks[:, 0]]
-                    goal_marks = project(_carried(points, chosen, poses, goal_poses), arena.camera)
-                    yield Task(arena, chosen, marks, goal_marks, goal_poses, (rgb, depth))
+                    goal_marks = project(_carried(points, marked, poses, goal_poses), arena.camera)
+                    yield Task(arena, chosen, marked, marks, goal_marks, goal_poses, (rgb, depth))
                     return
         raise ValueError(f"task: no scene for {movers} objects to move was found")
 
@@ -83,18 +87,18 @@ def marked_task(task, marks, goal_marks):
     movers = labels[marks[:, 1], marks[:, 0]].astype(int) - 1
     goal_poses = arena.poses()
     goal_poses[movers, :2] += there - points[:, :2]
-    return Task(arena, movers, marks, np.asarray(goal_marks, np.float32), goal_poses)
+    return Task(arena, movers, movers, marks, np.asarray(goal_marks, np.float32), goal_poses)
 
 
 def _line_up(arena, rng):
-    """Put object 0 on one side, object 1 in the middle; the others stay, if they are out of the way."""
+    """Put object 0 on one side, object 1 half across the way to the other; are all others out of the way?"""
     angle = rng.uniform(-np.pi, np.pi)
-    xy = 0.09 * np.array([np.cos(angle), np.sin(angle)])
-    arena.put(0, xy)
-    arena.put(1, [0, 0])
-    places = np.array([xy, [0, 0], -xy])
+    along = np.array([np.cos(angle), np.sin(angle)])
+    beside = np.array([-along[1], along[0]]) * rng.choice([-1, 1]) * sum(arena.radii[:2]) * IN_THE_WAY
+    arena.put(0, 0.09 * along)
+    arena.put(1, beside)
     others = arena.poses()[2:len(arena.bodies), :2]
-    apart = np.linalg.norm(others[:, None] - places, axis=2).min(initial=1)
+    apart = np.linalg.norm(others[:, None] - [0.09 * along, beside, -0.09 * along], axis=2).min(initial=1)
     return apart > 0.09 and sum(arena.radii[:2]) < 0.085 and arena.settle()
 
 
@@ -194,7 +198,7 @@ def next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration=N
                  else greedy_poke(view, goal, arena.camera, settings, rng))
         return planning.Plan(pokes, None, np.nan, np.nan)
     if policy == "oracle":
-        rollout = oracle_rollout(arena, view, np.concatenate([labels.ravel(), task.movers + 1]), settings)
+        rollout = oracle_rollout(arena, view, np.concatenate([labels.ravel(), task.marked + 1]), settings)
     else:
         learned = planning.learned_step(run, arena.camera, view.valid)
         rollout = partial(planning.roll, learned if policy == "learned" else planning.no_motion_step, view,

@@ -282,6 +282,7 @@ PLANNERS = {
 OBJECTS, POKES = (1, 2, 3), 10
 OBSTACLE_SCENES, OBSTACLE_TRIES = 3, 5
 AVOIDED = 0.01  # m; an obstacle that was moved by less was avoided
+AHEAD = {"horizon": 2, "candidates": 128}  # getting around an obstacle takes more than one poke
 
 
 def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
@@ -292,11 +293,11 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
     path = out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json"
     if path.exists():
         return json.loads(path.read_text())
-    _, policy, changes = PLANNERS.get(planner, (None, planner, {}))
+    _, policy, changes = PLANNERS.get(planner, (None, planner, {})) if movers else (None, planner, AHEAD)
     with control.random_task(seed, max(movers, 1), obstacle=movers == 0) as task:
         record = control.closed_loop(task, training.load_run(checkpoint), policy, planning.Search(**changes), POKES,
                                      seed=[seed, attempt])
-    others = np.setdiff1d(np.arange(record["poses"].shape[1]), record["movers"])
+    others = np.setdiff1d(np.arange(record["poses"].shape[1]), record["movers"])  # any but the one to be moved
     shifted = np.linalg.norm(record["poses"][:, others, :2] - record["poses"][0, others, :2], axis=2).max()
     last = np.repeat(record["distance"][-1:], POKES + 1 - len(record["distance"]), axis=0)  # it stopped: all stays
     distance = np.concatenate([record["distance"], last]).mean(axis=1)
@@ -355,6 +356,7 @@ def summarise_planning(results, curves):
     for planner in ("learned", "greedy"):
         runs = [each for key, each in results.items() if key[:2] == (planner, 0)]
         figures[f"{planner}_obstacle_avoided"] = float(np.mean([each["others_shifted_m"] < AVOIDED for each in runs]))
+        figures[f"{planner}_obstacle_shift_cm"] = float(100 * np.mean([each["others_shifted_m"] for each in runs]))
         figures[f"{planner}_obstacle_left"] = float(np.sum([each["distance_m"][-1] for each in runs])
                                                     / np.sum([each["distance_m"][0] for each in runs]))
     return figures

@@ -49,11 +49,16 @@ def test_marks_lie_on_the_movers_and_go_with_them():
             assert np.linalg.norm(there_mark - there[:2]) == pytest.approx(radius, abs=3e-3)
 
 
-def test_an_obstacle_stands_between_start_and_goal():
+def test_an_obstacle_stands_across_half_of_the_way_and_is_marked_to_stay():
     with control.random_task(0, 1, obstacle=True) as task:
         start, goal, other = (pose[:2] for pose in (task.arena.poses()[0], task.goal_poses[0], task.arena.poses()[1]))
+        way = (goal - start) / np.linalg.norm(goal - start)
         assert np.linalg.norm(goal - start) == pytest.approx(0.18, abs=0.01)
-        assert np.linalg.norm((goal + start) / 2 - other) < 0.01
+        assert abs((other - start) @ way) == pytest.approx(0.09, abs=0.01)
+        beside = abs((other - start) @ [-way[1], way[0]])
+        assert beside == pytest.approx(sum(task.arena.radii[:2]) / 2, abs=0.005)
+        assert task.movers.tolist() == [0] and task.marked.tolist() == [0, 1]
+        np.testing.assert_allclose(task.goal_marks[1], task.marks[1], atol=0.2)
 
 
 def test_distances_against_a_turn_by_hand():
@@ -242,4 +247,5 @@ def test_summary_of_the_control_experiment_by_hand():
     assert figures["learned_obstacle_avoided"] == pytest.approx(2 / 3)
     assert figures["greedy_obstacle_avoided"] == pytest.approx(1 / 3)
     assert figures["learned_obstacle_left"] == 0.5
+    assert figures["greedy_obstacle_shift_cm"] == pytest.approx(5 / 3)
     assert "0.15 \u00b1 0.07" in reproduce.planning_table(figures)

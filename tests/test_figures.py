@@ -371,7 +371,7 @@ def test_save_sequence_writes_a_frame_per_picture_or_nothing(tmp_path):
     with pytest.raises(ValueError, match=".gif"):
         figures.save_sequence(tmp_path / "plan.png", images, None, arrows, np.zeros((3, 1, 2)), [[8.0, 8.0]], [0, 0, 0])
     with pytest.raises(ValueError, match="images"):
-        figures.save_sequence(tmp_path / "new.gif", 2 + images, None, arrows, np.zeros((3, 1, 2)), [[1.0, 1]], [0, 0, 0])
+        figures.save_sequence(tmp_path / "new.gif", 2 + images, None, arrows, np.zeros((3, 1, 2)), [[1, 1]], [0, 0, 0])
     assert not (tmp_path / "new.gif").exists()
 
 
