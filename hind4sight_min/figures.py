@@ -416,7 +416,7 @@ def control_figure(curves, pokes):
         axes.set(xlabel="pokes", ylim=(0, None), xticks=range(0, pokes + 1, 2))
         axes.grid(alpha=0.3, axis="y")
     figure.axes[0].set_ylabel("mean distance to the goals [cm]", fontsize=10)
-    figure.axes[-1].legend(fontsize=8, loc="upper right")
+    figure.axes[-1].legend(fontsize=8, loc="center right")
     figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
     return figure
 
