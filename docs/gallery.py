@@ -4,7 +4,7 @@
     python docs/gallery.py --text
 
 The first runs every script of tutorials/, two at a time, and makes docs/gallery/ from the first two pictures each of
-them names; about a minute. The second leaves the pictures as they are. Everything that docs/gallery.md says about a
+them names; a minute or two. The second leaves the pictures as they are. Everything that docs/gallery.md says about a
 tutorial comes from the script's opening docstring, read without running it; a test fails while the page says anything
 else.
 """

@@ -128,33 +128,104 @@ def test_it_has_all_parts(stem):
     assert stem in PLANTED, "every tutorial needs a planted error that its checks notice"
 
 
+GOOD = '''"""A title: with a colon.
+
+Question: is it right,
+and is all of it there?
+
+Equations:
+- Eq. (2), Chamfer distance: `losses.distance_maps`, `losses.chamfer_loss`; tests/test_losses.py, tests/test_ops.py
+- Sec. III-A and IV-A, a poke: `simulator.Arena.poke`; tests/test_simulator.py
+
+Time: 4 s. Pictures: 42_maps.png, 42_gradient.png,
+42_film.gif.
+
+Last lines to expect:
+   a sum: expected 1 within 0.1, got 1.02
+42_good: all checks passed
+"""
+'''
+
+
+def test_what_a_docstring_says(tmp_path):
+    path = tmp_path / "42_good.py"
+    path.write_text(GOOD)
+    found = gallery.parse(path)
+    assert (found.number, found.title, found.time) == ("42", "A title: with a colon", "4 s")
+    assert found.question == "Is it right, and is all of it there?"
+    assert found.equations == [
+        ("Eq. (2), Chamfer distance", ["losses.distance_maps", "losses.chamfer_loss"],
+         ["tests/test_losses.py", "tests/test_ops.py"]),
+        ("Sec. III-A and IV-A, a poke", ["simulator.Arena.poke"], ["tests/test_simulator.py"])]
+    assert found.pictures == ["42_maps.png", "42_gradient.png", "42_film.gif"]
+    end = "   a sum: expected 1 within 0.1, got 0.98\n42_good: all checks passed\n"
+    assert gallery.as_announced(found, "before\n" + end)
+    for wrong in (end + "after\n", end.replace("0.1", "0.2"), end.replace("a sum", "a mean"), ""):
+        assert not gallery.as_announced(found, wrong)
+
+
 @pytest.mark.parametrize("old, new, message", [
+    ('"""A title', '0\n"""A title', "lacks its title"),  # no docstring at all
     ("Question:", "Query:", "lacks its question"),
     ("- Eq. (2)", "Eq. (2)", "lacks its equations"),
     ("Time: 4 s.", "Time: short.", "lacks its time"),
     ("Pictures:", "Figures:", "lacks its pictures"),
     ("Last lines to expect:", "Last lines:", "lacks its lines"),
-    ("The Chamfer distance: ", "\nThe Chamfer distance: ", None),  # leading blank lines do no harm
+    ("   a sum: expected 1 within 0.1, got 1.02\n", "", "lacks its lines"),
     ("; tests/test_losses.py", ", tests/test_losses.py", "expected '- what:"),
     ("`losses.chamfer_loss`", "`losses.chamfer`", "no function losses.chamfer in"),
     ("`losses.chamfer_loss`", "`loss.chamfer_loss`", "no function loss.chamfer_loss in"),
     ("`losses.chamfer_loss`", "`losses`", "no function losses in"),
+    ("Arena.poke`", "Arena.push`", "no function simulator.Arena.push in"),
     ("tests/test_ops.py", "tests/test_op.py", "no file tests/test_op.py"),
-    (", 03_gradient.png, 03_basin.png", "", "two or more pictures"),
-    ("03_gradient.png", "04_gradient.png", "two or more pictures"),
-    ("03_chamfer: all checks passed\n\"\"\"", "all checks passed\n\"\"\"", "expected the last line"),
-    ('"""', "'''", "lacks its title"),
+    (", 42_gradient.png,\n42_film.gif", "", "two or more pictures"),
+    ("42_gradient.png", "41_gradient.png", "two or more pictures"),
+    ("42_good: all checks passed", "all checks passed", "expected the last line"),
 ])
 def test_a_docstring_that_breaks_the_form_is_an_error_that_names_the_script(tmp_path, old, new, message):
-    source = SCRIPTS["03_chamfer"].read_text()
-    assert old in source
-    path = tmp_path / "03_chamfer.py"
-    path.write_text("0\n" + source if old == '"""' else source.replace(old, new, 1))
+    path = tmp_path / "42_good.py"
+    assert old in GOOD
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(ValueError, match=f"^42_good.py: .*{re.escape(message)}"):
+        gallery.parse(path)
+
+
+SCRIPT = GOOD + """
+import sys
+for name in ("42_maps.png", "42_gradient.png", "42_film.gif"):
+    open(sys.argv[2] + "/" + name, "w").close()
+print("   a sum: expected 1 within 0.1, got", 0.9)
+print("42_good: all checks passed")
+"""
+
+
+@pytest.mark.parametrize("old, new, message", [
+    ("0.9)", "0.8)", None),  # what is measured may differ
+    ('got", 0.9', 'found", 0.9', "expected the last lines"),
+    ('"42_film.gif"', "", "it made no picture 42_film.gif"),
+    ("import sys", "import syss", "it failed"),
+])
+def test_a_script_that_breaks_its_word_is_an_error_that_names_the_script(tmp_path, old, new, message):
+    path = tmp_path / "42_good.py"
+    path.write_text(SCRIPT.replace(old, new))
     if message:
-        with pytest.raises(ValueError, match=f"^03_chamfer.py: .*{re.escape(message)}"):
-            gallery.parse(path)
+        with pytest.raises(ValueError, match=f"^42_good.py: {message}"):
+            gallery.run(gallery.parse(path), tmp_path)
     else:
-        assert gallery.parse(path).title == gallery.parse(SCRIPTS["03_chamfer"]).title
+        assert gallery.run(gallery.parse(path), tmp_path) > 0
+
+
+def test_pictures_are_made_small(tmp_path):
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 256, (300, 1100, 3), dtype=np.uint8)).save(tmp_path / "wide.png")
+    (tmp_path / "small.png").write_bytes(gallery.small(tmp_path / "wide.png"))
+    with Image.open(tmp_path / "small.png") as picture:
+        assert picture.size == (800, 218) and picture.mode == "P"
+    (tmp_path / "film.gif").write_bytes(b"GIF89a")
+    assert gallery.small(tmp_path / "film.gif") == b"GIF89a"
+    (tmp_path / "film.gif").write_bytes(bytes(400_001))
+    with pytest.raises(ValueError, match="^film.gif: expected at most 400000 bytes, got 400001"):
+        gallery.small(tmp_path / "film.gif")
 
 
 def test_the_gallery_says_what_the_scripts_say():
