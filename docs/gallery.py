@@ -68,8 +68,8 @@ jupytext --to notebook tutorials/03_chamfer.py   # writes tutorials/03_chamfer.i
 jupyter notebook tutorials/03_chamfer.ipynb
 ```
 
-Where there is no `__file__`, as in a notebook, write the script's name in its place:
-`options = lesson.begin("03_chamfer.py")`. Notebooks are not kept in the repository; the scripts are what is tested."""
+Start it in the folder of the scripts, beside `lesson.py`. Notebooks are not kept in the repository; the scripts are
+what is tested."""
 
 
 @dataclass(frozen=True)

@@ -336,8 +336,8 @@ def population_figure(image, rounds, marks, goals):
     for i, (starts, targets, costs) in enumerate(rounds):
         axes = figure.add_subplot(1, len(rounds), i + 1, label=f"round {i + 1}")
         possible = np.flatnonzero(np.isfinite(costs))
-        _show(axes, 0.35 + 0.65 * image, f"Round {i + 1}: {len(possible)} of {len(costs)} possible\n"
-              f"lowest cost {np.min(costs):.2f}")
+        _show(axes, 0.45 + 0.5 * image.mean(axis=2, keepdims=True).repeat(3, axis=2),
+              f"Round {i + 1}: {len(possible)} of {len(costs)} possible\nlowest cost {np.min(costs):.2f}")
         for j in possible[np.argsort(-np.asarray(costs)[possible])]:
             shade = np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1)
             axes.plot(*np.transpose([starts[j], targets[j]]), color=colours(1 - shade), linewidth=1.2)
@@ -347,7 +347,7 @@ def population_figure(image, rounds, marks, goals):
             _arrow(axes, starts[best], targets[best])
         _draw_marks(axes, marks, goals)
         axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    figure.suptitle("CEM narrows its population down to one poke (yellow: cheap, blue: dear; arrow: the best)",
+    figure.suptitle("CEM narrows its population down (yellow: cheap, blue: dear; arrow: the best of the round)",
                     fontsize=12)
     return figure
 

@@ -343,7 +343,7 @@ def summarise_planning(results, curves):
         figures[f"{planner}_{movers}_left"] = float(mean[-1] / mean[0])
         figures[f"{planner}_{movers}_left_sd"] = float((curve[:, -1] / curve[:, 0]).std(ddof=1))
         figures[f"{planner}_{movers}_left_after_5"] = float(mean[5] / mean[0])
-        figures[f"{planner}_{movers}_falls"] = float((np.diff(mean) <= 0).all())
+        figures[f"{planner}_{movers}_falls"] = float((np.diff(mean) < 1e-6).all())  # to a micrometre
         turned = [each["angles_deg"] for key, each in results.items() if key[:2] == (planner, movers)]
         before, after = (np.concatenate([pair[i] for pair in turned]) for i in (0, 1))
         if len(before):

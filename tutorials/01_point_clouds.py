@@ -28,7 +28,7 @@ import numpy as np
 from hind4sight_min import geometry, interactions, ops
 from hind4sight_min.figures import PALETTE
 
-options = lesson.begin(__file__)
+options = lesson.begin("01_point_clouds")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 from hind4sight_min import evaluation, geometry, interactions, losses
 from hind4sight_min.figures import PALETTE
 
-options = lesson.begin(__file__)
+options = lesson.begin("02_rigid_motion")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]

@@ -14,8 +14,8 @@ Last lines to expect:
 03_chamfer: all checks passed
 """
 # %% [markdown]
-# Step through with the cells below, or run the whole file. `losses.distance_maps` is Eq. (2) as the package has it; with
-# your editor's "go to definition" it is one click away.
+# Step through with the cells below, or run the whole file. `losses.distance_maps` is Eq. (2) as the package has it;
+# with your editor's "go to definition" it is one click away.
 
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
@@ -28,7 +28,7 @@ from hind4sight_min import evaluation, losses, ops
 from hind4sight_min.figures import PALETTE
 from hind4sight_min.interactions import add_depth_noise, occupied_pixels, points_and_validity
 
-options = lesson.begin(__file__)
+options = lesson.begin("03_chamfer")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]
@@ -39,8 +39,8 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 #
 #     D_{P'->P}(i) = min_j |P'_i - P_j|^2        D_{P->P'}(j) = min_i |P'_i - P_j|^2
 #
-# One number per point, in square metres. Laid out on the pixels the points came from, each is a *distance map*. The sum of
-# both maps is the Chamfer distance, Eq. (2). Three points against two, small enough to check by eye:
+# One number per point, in square metres. Laid out on the pixels the points came from, each is a *distance map*. The
+# sum of both maps is the Chamfer distance, Eq. (2). Three points against two, small enough to check by eye:
 
 # %%
 predicted = np.array([[[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]]])  # (B=1, N=3, 3)
@@ -52,9 +52,9 @@ print("   predicted -> observed:", to_observed[0])   # 0.1^2, 0.2^2, 4^2 + 0.2^2
 print("   observed -> predicted:", to_predicted[0])  # 0.1^2, 0.2^2: nobody asks for the point at 5
 
 # %% [markdown]
-# Why both directions? The third predicted point is 4 m away from everything. Only the first map says so: every *observed*
-# point has a good partner without it. The other way round, an observed point that no predicted point explains shows only
-# in the second map. One direction alone can be cheated.
+# Why both directions? The third predicted point is 4 m away from everything. Only the first map says so: every
+# *observed* point has a good partner without it. The other way round, an observed point that no predicted point
+# explains shows only in the second map. One direction alone can be cheated.
 #
 # ## Two real clouds
 #
@@ -82,7 +82,8 @@ true_flow, _, moving = evaluation.true_motion(interactions, truth, ROW)  # (N, 3
 still_maps = losses.distance_maps(before, after, counted, next_counted)
 true_maps = losses.distance_maps(before + true_flow, after, counted, next_counted)
 still, best = (float(losses.chamfer_loss(*maps)[0]) for maps in (still_maps, true_maps))
-print(f"2. Poke {ROW}: Chamfer distance without motion {1e4 * still:.1f} cm^2, along the true flow {1e4 * best:.1f} cm^2")
+print(f"2. Poke {ROW}: Chamfer distance without motion {1e4 * still:.1f} cm^2, along the true flow "
+      f"{1e4 * best:.1f} cm^2")
 
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
 titles = ("no motion: $D_{P' \\to P}$", "no motion: $D_{P \\to P'}$", "true flow: $D_{P' \\to P}$",
@@ -100,9 +101,9 @@ lesson.keep(options, figure, "maps")
 # %% [markdown]
 # ## Where does the gradient point?
 #
-# **Predict before you run:** start from no motion, P' = the first cloud. Minus the gradient of the Chamfer distance, taken
-# at each predicted point, is the direction in which the loss wants that point to go. Which points get an arrow at all?
-# Do the arrows on the object all point along the true motion?
+# **Predict before you run:** start from no motion, P' = the first cloud. Minus the gradient of the Chamfer distance,
+# taken at each predicted point, is the direction in which the loss wants that point to go. Which points get an arrow
+# at all? Do the arrows on the object all point along the true motion?
 
 # %%
 def chamfer_of(cloud):
@@ -143,21 +144,23 @@ total = pull[on_object].mean(axis=0)
 left.quiver(x, y, *total[:2], color="black", angles="xy", scale_units="xy", scale=1, width=0.012, zorder=5,
             label="their mean, true to length")
 left.legend(fontsize=8, loc="lower right")
-figure.suptitle("Seen from above: single points are pulled to the nearest edge; only the object as a whole is pulled right",
-                fontsize=11)
+figure.suptitle("Seen from above: single points are pulled to the nearest edge; only the object as a whole is pulled "
+                "right", fontsize=11)
 lesson.keep(options, figure, "gradient")
 
 # %% [markdown]
-# Three lessons. Points that stay have themselves as nearest neighbour and get no arrow: the table is quiet by itself. A
-# single point is a bad guide: it is pulled to the nearest edge of the other cloud, and the few points nearest to the far
-# side collect the pull of all the observed points there (the long arrows). But *summed over the object*, the pull is
-# right. This is why the model moves whole masks rigidly (Eq. 1) and not points one by one: the mask does the summing.
+# Three lessons. Points that stay have themselves as nearest neighbour and get no arrow: the table is quiet by itself.
+# A single point is a bad guide: it is pulled to the nearest edge of the other cloud, and the few points nearest to
+# the far side collect the pull of all the observed points there (the long arrows). But *summed over the object*, the
+# pull is right. This is why the model moves whole masks rigidly (Eq. 1) and not points one by one: the mask does the
+# summing.
 #
 # ## How far does the slope reach, and what does noise do to it?
 #
 # Move the object by 0 to 2 times its true motion and draw the Chamfer distance. Then add the paper's depth noise: a
-# standard deviation of 1 cm at every pixel, drawn anew for each picture. Now every table point finds a *spurious match*,
-# whatever the object does: noise lifts the whole curve. What matters is whether its minimum stays where it was.
+# standard deviation of 1 cm at every pixel, drawn anew for each picture. Now every table point finds a *spurious
+# match*, whatever the object does: noise lifts the whole curve. What matters is whether its minimum stays where it
+# was.
 
 # %%
 rng = np.random.default_rng(0)
@@ -167,8 +170,8 @@ scales = np.linspace(0, 2, 21)
 def curve(depth_before, depth_after):
     """Chamfer distance in cm^2 with the object moved by every scale times its true motion."""
     first, second, here, there = clouds(depth_before, depth_after)
-    return np.array([1e4 * losses.chamfer_loss(*losses.distance_maps(first + np.float32(scale) * true_flow, second, here,
-                                                                     there))[0] for scale in scales])
+    maps = [losses.distance_maps(first + np.float32(scale) * true_flow, second, here, there) for scale in scales]
+    return np.array([1e4 * losses.chamfer_loss(*each)[0] for each in maps])
 
 
 depths = interactions.depth_before[ROW], interactions.depth_after[ROW]
@@ -196,9 +199,15 @@ lesson.keep(options, figure, "basin")
 
 # %% Check
 print("5. Check")
-lesson.check("three points against two, predicted -> observed", float(to_observed.sum()), 0.01 + 0.04 + 16.04, within=1e-9)
-pairs = np.sum((before[0][:, None] - after[0][None, next_counted[0]]) ** 2, axis=2).min(axis=1)  # brute force
-lesson.check("largest difference to brute force [m^2]", float(np.abs(pairs * counted[0] - still_maps[0][0]).max()), below=1e-6)
+lesson.check("three points against two, predicted -> observed", float(to_observed.sum()), 0.01 + 0.04 + 16.04,
+             within=1e-9)
+squared = np.sum((before[0][:, None] - after[0]) ** 2, axis=2)  # brute force, (N, N)
+there = squared[:, next_counted[0]].min(axis=1) * counted[0]
+back = squared[counted[0]].min(axis=0) * next_counted[0]
+lesson.check("predicted -> observed, largest difference to brute force [m^2]",
+             float(np.abs(there - still_maps[0][0]).max()), below=1e-6)
+lesson.check("observed -> predicted, the same [m^2]", float(np.abs(back - still_maps[1][0]).max()), below=1e-6)
+lesson.check("Eq. (2) without motion / by brute force", still / float(there.sum() + back.sum()), 1.0, within=1e-4)
 lesson.check("Chamfer along the true flow / without motion", best / still, above=0, below=0.3)
 lesson.check("scale at which the noise-free curve is lowest", float(scales[clean.argmin()]), 1.0, within=0.15)
 lesson.check("share of single arrows within 60 degrees of the true motion", share, above=0.3, below=0.9)

@@ -30,7 +30,7 @@ from scipy.ndimage import map_coordinates
 from hind4sight_min import evaluation, geometry, losses, training
 from hind4sight_min.figures import PALETTE, colour_wheel, flow_to_rgb
 
-options = lesson.begin(__file__)
+options = lesson.begin("04_warping")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]

@@ -29,7 +29,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from hind4sight_min import evaluation, geometry, losses, training
 from hind4sight_min.figures import PALETTE, flow_to_rgb
 
-options = lesson.begin(__file__)
+options = lesson.begin("05_smoothness")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]

@@ -7,7 +7,7 @@ Equations:
 - Sec. IV-A, background subtraction and the grid: `interactions.occupied_pixels`, `simulator.occupied_cells`, `interactions.cells_of`; tests/test_interactions.py, tests/test_simulator.py
 - Sec. III-A and IV-A, a poke: `simulator.Arena.sample_poke`, `simulator.Arena.poke`, `networks.poke_frame`; tests/test_simulator.py, tests/test_networks.py
 - Sec. IV-B, the data set: `simulator.collect_shard`; tests/test_simulator.py
-- Sec. IV-C, the true scene flow: `interactions.true_scene_flow`; tests/test_interactions.py
+- Sec. IV-C, true scene flow: `interactions.true_scene_flow`; tests/test_interactions.py
 
 Time: 6 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
 
@@ -31,7 +31,7 @@ from hind4sight_min import evaluation, interactions, networks, simulator
 from hind4sight_min.figures import OUTLINE, PALETTE
 from hind4sight_min.geometry import project, unproject
 
-options = lesson.begin(__file__)
+options = lesson.begin("06_poke_simulator")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]

@@ -30,7 +30,7 @@ import numpy as np
 from hind4sight_min import evaluation, geometry, losses, networks, training
 from hind4sight_min.figures import PALETTE, _arrow, _blend, flow_to_rgb
 
-options = lesson.begin(__file__)
+options = lesson.begin("07_networks")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 data, truth = lesson.pokes()

@@ -28,7 +28,7 @@ from hind4sight_min import evaluation, networks, training
 from hind4sight_min.figures import PALETTE, TERMS, _blend, flow_to_rgb
 from hind4sight_min.geometry import project
 
-options = lesson.begin(__file__)
+options = lesson.begin("08_training")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 train, _ = lesson.pokes("train")  # _ is the truth: training never sees it
@@ -173,7 +173,7 @@ axes.flat[7].set_ylim(0, 1.5)
 axes.flat[7].legend(fontsize=8, loc="upper center")
 for panel in axes[1]:
     panel.set_xlabel("step")
-figure.suptitle("The losses fall below what no motion costs (dotted); masks that nobody asked for come with it",
+figure.suptitle("The losses fall, most of them below what no motion costs (dotted); masks come with it",
                 fontsize=11)
 lesson.keep(options, figure, "losses")
 
@@ -212,7 +212,7 @@ for i, line in enumerate(axes):
         panel_of(panel, _blend(pictures[i], masks[i][parts[i]][..., 1:]), f"step {at}" if i == 0 else "")
     panel_of(line[-1], _blend(pictures[i], moved[i][..., None].astype(float)), "truth" if i == 0 else "")
     poke_on(line[0], i)
-figure.suptitle("Masks of two held-out pokes: first all a little, then hardly anything, then what the poke moves",
+figure.suptitle("Masks of two held-out pokes: first all a little, then hardly anything, then (part of) what moves",
                 fontsize=11)
 lesson.keep(options, figure, "masks")
 

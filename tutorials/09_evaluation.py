@@ -31,7 +31,7 @@ import numpy as np
 from hind4sight_min import evaluation, interactions, reproduce, training
 from hind4sight_min.figures import PALETTE
 
-options = lesson.begin(__file__)
+options = lesson.begin("09_evaluation")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 POKES = 40 if options.quick else 100

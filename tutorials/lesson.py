@@ -11,18 +11,18 @@ import matplotlib  # noqa: E402
 STEPPING = "ipykernel" in sys.modules  # in an editor, cell by cell: pictures appear there by themselves
 
 
-def begin(file):
-    """The options of a tutorial -> Namespace with out (Path), show and quick; `file` is the script's __file__."""
+def begin(name):
+    """The options of the tutorial `name` -> Namespace with name, out (Path), show and quick."""
     parser = argparse.ArgumentParser(description=sys.modules["__main__"].__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path(file).resolve().parent.parent / "runs" / "tutorials",
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent.parent / "runs" / "tutorials",
                         help="folder for the pictures (runs/tutorials in the clone)")
     parser.add_argument("--show", action="store_true", help="open a window for every picture")
     parser.add_argument("--quick", action="store_true", help="a smaller budget: the same lesson in less time")
     options = parser.parse_args([] if STEPPING else None)
     if not (options.show or STEPPING):
         matplotlib.use("Agg")
-    options.name = Path(file).stem
+    options.name = name
     return options
 
 
