@@ -332,7 +332,7 @@ def train(interactions, run, jobs=1, on_epoch=None, on_step=None, truth=None):
 
     truth: for SE3-Nets, and for nothing else. on_epoch(run), on_step(run) are called after each. The gradient of a
     batch is the sum over chunks that may be computed in parallel and are added in order, so the result does not depend
-    on `jobs`.
+    on `jobs` (if BLAS has one thread here as in the workers: import the package before NumPy).
     Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
     """
     if interactions.meta["camera"] != run.meta["camera"]:
