@@ -1,6 +1,6 @@
 """Hind4sight-Net in a few readable NumPy files: unsupervised dynamics models from pokes.
 
-Read in this order: geometry, ops, losses, networks, training, interactions, simulator, evaluation.
+Read in this order: geometry, ops, losses, networks, training, interactions, simulator, evaluation, planning, control.
 """
 import os
 import signal
