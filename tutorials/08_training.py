@@ -24,7 +24,7 @@ import lesson
 import numpy as np
 from matplotlib.animation import PillowWriter
 
-from hind4sight_min import evaluation, networks, training
+from hind4sight_min import evaluation, losses, networks, training
 from hind4sight_min.figures import PALETTE, TERMS, _blend, flow_to_rgb
 from hind4sight_min.geometry import project
 
@@ -267,6 +267,13 @@ print(f"   animation: {animation.name}, {animation.stat().st_size / 1000:.0f} kB
 
 # %% Check
 print("4. Check")
+made_up = {name: np.array([number, number + 2.0]) for number, name in enumerate(training.WEIGHTS, 1)}  # two pokes each
+expected = sum(weight * (number + 1) for number, weight in enumerate(training.WEIGHTS.values(), 1))
+lesson.check("Eq. (6) by hand, ratio", float(losses.full_loss(made_up, training.WEIGHTS)) / expected, 1.0, within=1e-9)
+for name in made_up:  # each term on its own, or a small one could be lost in the sum
+    alone = {other: float(other == name) for other in made_up}
+    lesson.check(f"Eq. (6) with {name} alone", float(losses.full_loss(made_up, alone)), made_up[name].mean(),
+                 within=1e-9)
 one = training.start_run(recipe, train)
 gradients = np.random.default_rng(0).standard_normal((3, one.vector.size)).astype(np.float32)
 mean, square, by_hand = 0.0, 0.0, one.vector.astype(float)

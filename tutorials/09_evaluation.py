@@ -79,13 +79,16 @@ for name, unit, what, baseline in (
 # comes out larger, and which pokes make the difference?
 
 # %%
-whole, prediction, _, starts_map, ends_map = evaluation.predict(run, data, np.arange(POKES))
+whole, prediction, flow, starts_map, ends_map = evaluation.predict(run, data, np.arange(POKES))
 errors, motions = np.zeros(POKES), np.zeros(POKES)  # sums over moving points, m^2
+lengths, pixels = np.zeros(POKES), np.zeros(POKES)  # sums of end-point errors, m and px
 for row in range(POKES):
-    true_flow, _, moving = evaluation.true_motion(data, truth, row)  # (N, 3) m, ..., (N,) bool
+    true_flow, true_pixels, moving = evaluation.true_motion(data, truth, row)  # (N, 3) m, ..., (N,) bool
     predicted = prediction.points[row] - whole.points[row]
     errors[row] = np.sum((predicted - true_flow)[moving] ** 2)
     motions[row] = np.sum(true_flow[moving] ** 2)
+    lengths[row] = np.linalg.norm(predicted - true_flow, axis=1)[moving].sum()
+    pixels[row] = np.linalg.norm(flow[row].reshape(-1, 2) - true_pixels, axis=1)[moving].sum()
 counts = np.array([evaluation.true_motion(data, truth, row)[2].sum() for row in range(POKES)])
 moved = counts > 0
 ratios = errors[moved] / motions[moved]
@@ -229,6 +232,10 @@ lesson.check("ratio by hand, difference to evaluate", errors.sum() / motions.sum
              within=1e-5)
 lesson.check("RMS of no motion by hand, difference [cm]",
              100 * float(np.sqrt(motions.sum() / counts.sum())) - metrics["no_motion_rmse_cm"], 0, within=1e-4)
+lesson.check("end-point error by hand, difference [cm]", float(100 * lengths.sum() / counts.sum())
+             - metrics["flow_epe_cm"], 0, within=1e-4)
+lesson.check("of the optical flow by hand, difference [px]", float(pixels.sum() / counts.sum())
+             - metrics["optical_epe_px"], 0, within=1e-3)
 still = np.array([~evaluation.true_motion(data, truth, row)[2] & (data.depth_before[row] > 0).ravel()
                   for row in range(POKES)])
 drift = 100 * np.linalg.norm(prediction.points - whole.points, axis=2)[still].mean()
