@@ -2,8 +2,8 @@
 
     python benchmarks/planning.py [--rounds 9] [--json out.json]
 
-One step is what the robot waits for between two pokes: the default candidates, iterations and horizon of planning.Search,
-on one core, for the start of test scene 0 with two objects to move. Medians over the rounds.
+One step is what the robot waits for between two pokes: the default candidates, iterations and horizon of
+planning.Search, on one core, for the start of test scene 0 with two objects to move. Medians over the rounds.
 """
 import argparse
 import time
@@ -32,11 +32,8 @@ def main():
 
     planning.forward_model = timed
     with control.random_task(0, 2) as task:
-        arena, settings = task.arena, asdict(task.arena.settings)
-        camera, depth = arena.camera, arena.observe()[1]
-        marks = planning.points_at(task.marks, depth, arena.empty_depth, camera, settings)
-        view = planning.view_of(depth, arena.empty_depth, camera, settings, marks)
-        goal = planning.goal_of(task.goal_marks, camera, settings, task.goal[1], arena.empty_depth)
+        camera, settings = task.arena.camera, asdict(task.arena.settings)
+        _, view, goal = control.first_look(task)
     step = planning.learned_step(run, camera, view.valid)
     seconds, shares = [], []
     for seed in range(args.rounds):

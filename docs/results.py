@@ -129,13 +129,19 @@ def ship(checkpoint, target=ROOT / "data_small" / "checkpoint.npz"):
     save_run(target, run, resumable=False)
 
 
+def recorded(name):
+    """The figures of docs/results/NAME.json, or None."""
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text())["figures"] if path.exists() else None
+
+
 def gather():
     """The headline figures that have been recorded -> flat dict."""
     found = {}
     for headline, (name, figure, *_) in HEADLINES.items():
-        path = RESULTS / f"{name}.json"
-        if path.exists():
-            found[headline] = json.loads(path.read_text())["figures"][figure]
+        figures = recorded(name)
+        if figures:
+            found[headline] = figures[figure]
     return found
 
 
@@ -151,18 +157,17 @@ def table(summary):
 
 def paper_tables():
     """The paper's tables with ours beside them, once the full runs are recorded."""
-    path = RESULTS / "reproduce.json"
-    if not path.exists():
+    figures = recorded("reproduce")
+    if not figures:
         return "The full runs take a night and are not recorded yet; `--quick` shows the tables in miniature."
-    return reproduce.tables_text(list(reproduce.TABLES), json.loads(path.read_text())["figures"])
+    return reproduce.tables_text(list(reproduce.TABLES), figures)
 
 
 def control_table():
     """The control experiment, once it is recorded."""
-    path = RESULTS / "planning.json"
-    if not path.exists():
+    figures = recorded("planning")
+    if not figures:
         return "Not recorded yet; `hind4sight reproduce planning --quick` shows it in miniature."
-    figures = json.loads(path.read_text())["figures"]
     obstacle = []
     for planner in ("learned", "greedy"):
         avoided, shift = (figures[f"{planner}_obstacle_{name}"] for name in ("avoided", "shift_cm"))

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hind4sight_min import evaluation, losses, training
 from hind4sight_min.__main__ import data_small
-from hind4sight_min.figures import _arrow, _blend, _show, flow_to_rgb, save_figure
+from hind4sight_min.figures import blend, draw_arrow, flow_to_rgb, save_figure, show_image
 from hind4sight_min.geometry import optical_flow, project
 from hind4sight_min.interactions import load_interactions, load_truth, write_text
 from hind4sight_min.objects import HELD_OUT
@@ -128,12 +128,12 @@ def draw(examples):
         true = found["true"].reshape(*shape, 2)
         scale = np.linalg.norm(true, axis=2).max()
         image = data.rgb_before[row] / 255
-        _show(line[0], image, title.capitalize())
+        show_image(line[0], image, title.capitalize())
         ends = np.array([[*data.starts[row], 0.02], [*data.pokes[row, :2], 0.02]])
-        _arrow(line[0], *project(ends, data.camera))
-        _show(line[1], _blend(image, found["masks"].reshape(*shape, -1)[..., 1:]), "Predicted masks")
-        _show(line[2], flow_to_rgb(found["flow"], scale), "Predicted optical flow")
-        _show(line[3], flow_to_rgb(true, scale), "True optical flow, same colours")
+        draw_arrow(line[0], *project(ends, data.camera))
+        show_image(line[1], blend(image, found["masks"].reshape(*shape, -1)[..., 1:]), "Predicted masks")
+        show_image(line[2], flow_to_rgb(found["flow"], scale), "Predicted optical flow")
+        show_image(line[3], flow_to_rgb(true, scale), "True optical flow, same colours")
     return figure
 
 

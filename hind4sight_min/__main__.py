@@ -232,10 +232,7 @@ def plan_and_show(run, task, policy, search, budget, out, meta):
 
     def on_iteration(iteration, population, costs, mean, deviation):
         if len(rounds) == iteration:  # of the first plan
-            targets = population[:, 0, :2]
-            back = np.stack([np.cos(population[:, 0, 2]), np.sin(population[:, 0, 2])], axis=1)
-            ends = np.stack([targets - settings["poke_length"][0] * back, targets])
-            rounds.append((*planning.places_on_table(ends, camera), costs))
+            rounds.append((*planning.arrows_of(population[:, 0], settings, camera), costs))
 
     record = control.closed_loop(task, run, policy, search, budget, meta["seed"], on_iteration)
     distance, pokes = record["distance"].mean(axis=1), len(record["pokes"])

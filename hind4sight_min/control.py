@@ -190,6 +190,16 @@ def distances(poses, task):
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 
+def first_look(task):
+    """A task as the robot meets it -> (rgb, depth, labels) of Arena.observe, planning.View, planning.Goal."""
+    arena, settings = task.arena, asdict(task.arena.settings)
+    rgb, depth, labels = arena.observe()
+    marks = planning.points_at(task.marks, depth, arena.empty_depth, arena.camera, settings)
+    view = planning.view_of(depth, arena.empty_depth, arena.camera, settings, marks)
+    goal = planning.goal_of(task.goal_marks, arena.camera, settings, task.goal and task.goal[1], arena.empty_depth)
+    return (rgb, depth, labels), view, goal
+
+
 def next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration=None):
     """What a planner would do now -> planning.Plan; costs of NaN where it has none."""
     arena, settings = task.arena, asdict(task.arena.settings)
@@ -207,9 +217,7 @@ def next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration=N
 
 
 def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None):
-    """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent.
-
-    -> everything that happened, a dict.
+    """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent -> a dict.
 
     policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
     Of T pokes: rgb (T+1, H, W, 3), depth (T+1, H, W), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, pokes (T, 3),
@@ -222,10 +230,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
     arena, rng = task.arena, np.random.default_rng(seed)
     camera, empty, settings = arena.camera, arena.empty_depth, asdict(arena.settings)
     planning.check_camera(run, camera)
-    rgb, depth, labels = arena.observe()
-    marks = planning.points_at(task.marks, depth, empty, camera, settings)
-    goal = planning.goal_of(task.goal_marks, camera, settings, task.goal and task.goal[1], empty)
-    view = planning.view_of(depth, empty, camera, settings, marks)
+    (rgb, depth, labels), view, goal = first_look(task)
+    marks = view.cloud[-view.marked:]
     frames, poses, places = [(rgb, depth)], [arena.poses()], [marks]
     pokes, starts, costs, seconds = [], [], [], []
     while len(pokes) < budget:

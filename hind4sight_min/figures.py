@@ -74,7 +74,7 @@ def colour_wheel(size):
 
 # --- panels ----------------------------------------------------------------------------------------------
 
-def _show(axes, picture, title, **how):
+def show_image(axes, picture, title, **how):
     """One image panel: pixels as they are, no ticks. Returns the image, for a colour bar."""
     axes.set_title(title, fontsize=11)
     axes.set_xticks([])
@@ -88,7 +88,7 @@ def _colour_bar(figure, image, axes, label, **how):
     bar.ax.tick_params(labelsize=9)
 
 
-def _arrow(axes, start, target):
+def draw_arrow(axes, start, target):
     """The poke, with a white outline. The view stays as it is."""
     axes.add_patch(FancyArrowPatch(start, target, arrowstyle="-|>", mutation_scale=14, linewidth=2, color=POKE,
                                    shrinkA=0, shrinkB=0, path_effects=OUTLINE, zorder=5))
@@ -102,7 +102,7 @@ def _arena_panel(axes, title):
     axes.locator_params(nbins=6)
 
 
-def _blend(image, weights):
+def blend(image, weights):
     """Weights (H, W, K) of K colours over the grey image; what they leave of 1 stays grey."""
     colours = PALETTE[np.arange(weights.shape[2]) % len(PALETTE)]
     weights = 0.85 * weights  # the texture below stays visible
@@ -124,7 +124,7 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
                     units="inches", width=width, headwidth=0.06 / width, headlength=0.07 / width,
                     headaxislength=0.06 / width, zorder=4)
         handles.append(Line2D([], [], color=colour, linewidth=100 * width, label=f"{label}\n({moved.sum()} points)"))
-    _arrow(axes, start, target)
+    draw_arrow(axes, start, target)
     handles.append(Line2D([], [], color=POKE, linewidth=2, label="poke"))
     inside = np.clip(inside, -0.6 * arena, 0.6 * arena)  # a wild prediction may leave the view
     centre, half = (inside.max(axis=0) + inside.min(axis=0)) / 2, np.ptp(inside, axis=0) / 2 + 0.02
@@ -138,7 +138,7 @@ def _draw_flows(panels, flows):
     """Optical flows on one scale, so that their colours compare; the wheel and its rim's length on the first."""
     scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for *_, flow in flows))  # px
     for label, title, flow in flows:
-        _show(panels[label], flow_to_rgb(flow, scale), title)
+        show_image(panels[label], flow_to_rgb(flow, scale), title)
     label, _, flow = flows[0]
     axes, length = panels[label], np.linalg.norm(flow, axis=-1)
     (middle_y, middle_x), quarters = np.array(length.shape) // 2, {}
@@ -160,8 +160,8 @@ def _draw_error(figure, axes, image, warped, flow, shared):
     x, y = u + flow[..., 0], v + flow[..., 1]
     counted = shared & (x > -margin) & (x < width - 1 + margin) & (y > -margin) & (y < height - 1 + margin)
     error = np.abs(image - warped).sum(axis=-1)  # Eq. (3) before the sum over pixels
-    shown = _show(axes, np.ma.array(error, mask=~counted), "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\n"
-                  "grey: not counted", cmap=MAGMA, vmin=0, vmax=max(0.1, (error * counted).max()))
+    shown = show_image(axes, np.ma.array(error, mask=~counted), "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\n"
+                       "grey: not counted", cmap=MAGMA, vmin=0, vmax=max(0.1, (error * counted).max()))
     _colour_bar(figure, shown, axes, "sum over R, G, B", location="bottom", shrink=0.8)
 
 
@@ -172,7 +172,7 @@ def _draw_distances(figure, panels, maps):
     distances = [100 * np.sqrt(squared) for squared in maps]
     top = max(0.1, *(distance.max() for distance in distances))
     for axes, title, distance in zip(panels, titles, distances):
-        shown = _show(axes, distance, title, cmap="viridis", vmin=0, vmax=top)
+        shown = show_image(axes, distance, title, cmap="viridis", vmin=0, vmax=top)
     _colour_bar(figure, shown, panels, "square root of D, cm", location="bottom", shrink=0.8)
 
 
@@ -249,16 +249,18 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
                               "distance_observed"])
     figure.suptitle(title or f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0",
                     fontsize=13)
-    _show(panels["before"], image, "Before: image $I_t$\nand the poke $u_t$")
-    _arrow(panels["before"], *poke_pixels)
-    _show(panels["after"], next_image, "After: image $I_{t+1}$")
-    _show(panels["masks"], _blend(image, masks[..., 1:]), "Predicted masks $m_t^k$ (Eq. 1)\na colour each")
+    show_image(panels["before"], image, "Before: image $I_t$\nand the poke $u_t$")
+    draw_arrow(panels["before"], *poke_pixels)
+    show_image(panels["after"], next_image, "After: image $I_{t+1}$")
+    show_image(panels["masks"], blend(image, masks[..., 1:]), "Predicted masks $m_t^k$ (Eq. 1)\na colour each")
     if true_labels is not None:
         true_labels = _checked("true_labels", true_labels, *size, low=0)
         moved = true_labels[..., None] == np.arange(1, int(true_labels.max()) + 1)
-        _show(panels["labels"], _blend(image, moved.astype(float)), "True objects that moved\n(colours of their own)")
+        show_image(panels["labels"], blend(image, moved.astype(float)),
+                   "True objects that moved\n(colours of their own)")
     _draw_flows(panels, flows)
-    _show(panels["warped"], np.clip(warped, 0, 1), "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
+    show_image(panels["warped"], np.clip(warped, 0, 1),
+               "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
     _draw_error(figure, panels["error"], image, warped, optical_flow, shared)
     _draw_distances(figure, [panels["distance_predicted"], panels["distance_observed"]], maps)
     _arena_panel(panels["scene_flow"], "Scene flow from above (Eq. 1)")
@@ -336,15 +338,15 @@ def population_figure(image, rounds, marks, goals):
     for i, (starts, targets, costs) in enumerate(rounds):
         axes = figure.add_subplot(1, len(rounds), i + 1, label=f"round {i + 1}")
         possible = np.flatnonzero(np.isfinite(costs))
-        _show(axes, 0.45 + 0.5 * image.mean(axis=2, keepdims=True).repeat(3, axis=2),
-              f"Round {i + 1}: {len(possible)} of {len(costs)} possible\nlowest cost {np.min(costs):.2f}")
+        show_image(axes, 0.45 + 0.5 * image.mean(axis=2, keepdims=True).repeat(3, axis=2),
+                   f"Round {i + 1}: {len(possible)} of {len(costs)} possible\nlowest cost {np.min(costs):.2f}")
         for j in possible[np.argsort(-np.asarray(costs)[possible])]:
             shade = np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1)
             axes.plot(*np.transpose([starts[j], targets[j]]), color=colours(1 - shade), linewidth=1.2)
             axes.plot(*targets[j], ".", color=colours(1 - shade), markersize=5)
         if len(possible):
             best = int(np.argmin(costs))
-            _arrow(axes, starts[best], targets[best])
+            draw_arrow(axes, starts[best], targets[best])
         _draw_marks(axes, marks, goals)
         axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
     figure.suptitle("CEM narrows its population down (yellow: cheap, blue: dear; arrow: the best of the round)",
@@ -378,13 +380,13 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
                 axes = figure.add_subplot(1, columns, 1)
                 last = t == len(images) - 1
                 text = f"after {t} pokes: {100 * distances[t]:.1f} cm to go"
-                _show(axes, image, text + ("" if last else f"\nnext: poke {t + 1}"))
+                show_image(axes, image, text + ("" if last else f"\nnext: poke {t + 1}"))
                 _draw_marks(axes, marks[t], goals)
                 if not last and np.isfinite(arrows[t]).all():
-                    _arrow(axes, *arrows[t])
+                    draw_arrow(axes, *arrows[t])
                 axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
                 if goal_image is not None:
-                    _show(figure.add_subplot(1, columns, 2), goal_image, "goal\n")
+                    show_image(figure.add_subplot(1, columns, 2), goal_image, "goal\n")
                 for _ in range(2 if last else 1):
                     writer.grab_frame()
         gif.replace(temporary)

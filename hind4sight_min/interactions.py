@@ -101,9 +101,12 @@ def occupied_pixels(depth, empty_depth, threshold=OCCUPIED):
 
 
 def standing(depth, empty_depth, camera, settings, threshold=OCCUPIED):
-    """Which pixels show something that stands inside the walls, (..., H, W) bool: `occupied_pixels`, less the walls."""
-    inside = np.abs(unproject(depth, camera)[..., :2]).max(axis=-1) < settings["arena"] / 2
-    return inside & occupied_pixels(depth, empty_depth, threshold)
+    """The picture's points (..., H, W, 3) m, arena, and which of them are of something that stands inside the walls,
+    (..., H, W) bool: `occupied_pixels`, less the walls.
+    """
+    points = unproject(depth, camera)
+    inside = np.abs(points[..., :2]).max(axis=-1) < settings["arena"] / 2
+    return points, inside & occupied_pixels(depth, empty_depth, threshold)
 
 
 def rotation_from_quaternion(quaternions):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .geometry import Camera, project, unproject
+from .geometry import Camera, project
 from .interactions import cell_centres, cells_of, grid_shape, standing
 from .networks import forward_model, window_shape, windows
 
@@ -86,8 +86,7 @@ def points_at(pixels, depth, empty_depth, camera, settings):
     pixels = np.asarray(pixels, float)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or not len(pixels):
         raise ValueError(f"marks: expected (M, 2) pixels, at least one, got shape {pixels.shape}")
-    objects = standing(depth, empty_depth, camera, settings)
-    points = unproject(depth, camera)
+    points, objects = standing(depth, empty_depth, camera, settings)
     found = []
     for x, y in pixels:
         column, row = (int(np.rint(value)) if np.isfinite(value) else -1 for value in (x, y))
@@ -101,12 +100,12 @@ def points_at(pixels, depth, empty_depth, camera, settings):
 
 def view_of(depth, empty_depth, camera, settings, marks):
     """A View of a depth picture (H, W) m and the marked points (M, 3) m. Raises NoPoke where no object stands."""
-    objects = standing(depth, empty_depth, camera, settings).ravel()
+    points, objects = standing(depth, empty_depth, camera, settings)
     if not objects.any():
         raise NoPoke("scene: no object stands in the arena")
-    points, on = unproject(depth, camera).reshape(-1, 3), np.ones(len(marks), bool)
-    return View(np.concatenate([points, marks]).astype(np.float32), np.concatenate([depth.ravel() > 0, on]),
-                np.concatenate([objects, on]), len(marks))
+    on = np.ones(len(marks), bool)
+    return View(np.concatenate([points.reshape(-1, 3), marks]).astype(np.float32),
+                np.concatenate([depth.ravel() > 0, on]), np.concatenate([objects.ravel(), on]), len(marks))
 
 
 def places_at(pixels, heights, camera, settings):
@@ -134,6 +133,12 @@ def places_on_table(places, camera):
     return project(np.concatenate([places, np.zeros(places.shape[:-1] + (1,))], axis=-1), camera)
 
 
+def arrows_of(pokes, settings, camera):
+    """Pokes (J, 3) as arrows of the shortest length: starts and targets, pixels (J, 2) each."""
+    back = settings["poke_length"][0] * np.stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2])], axis=1)
+    return places_on_table(pokes[:, :2] - back, camera), places_on_table(pokes[:, :2], camera)
+
+
 def goal_of(pixels, camera, settings, depth=None, empty_depth=None):
     """A Goal from the pixels (M, 2) where the marked points shall be and, for the Chamfer term, its depth picture.
 
@@ -141,10 +146,10 @@ def goal_of(pixels, camera, settings, depth=None, empty_depth=None):
     """
     if depth is None:
         return Goal(np.asarray(pixels, np.float32), None)
-    objects = standing(depth, empty_depth, camera, settings)
+    points, objects = standing(depth, empty_depth, camera, settings)
     if not objects.any():
         raise ValueError("goal scene: no object stands in the arena")
-    return Goal(np.asarray(pixels, np.float32), unproject(depth, camera)[objects].astype(np.float32))
+    return Goal(np.asarray(pixels, np.float32), points[objects].astype(np.float32))
 
 
 # --- actions inside the training distribution --------------------------------------------------------------------

@@ -6,7 +6,7 @@ finished cell leaves its figures in a file and is never run again. This file rea
 import json
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -130,6 +130,27 @@ def run_cell(cell, out, scale, save_every=60.0):
 
 # --- all of them ------------------------------------------------------------------------------------------------
 
+def run_all(function, tasks, jobs, report=None):
+    """{task: function(*task)} of tuples, in their order, over so many processes; report(done, task, result) is called
+    as each of them ends.
+    """
+    results = {}
+    with worker_pool(jobs) as pool:
+        try:
+            waiting = {pool.submit(function, *task): task for task in tasks}
+            for future in as_completed(waiting):
+                task = waiting[future]
+                results[task] = future.result()
+                if report:
+                    report(len(results), task, results[task])
+        except BaseException:  # an interrupt must not wait for what runs: its files are on disk
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+    return {task: results[task] for task in tasks}
+
+
 def reproduce(tables, out, scale, jobs=1, progress=None):
     """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
     out = Path(out)
@@ -140,21 +161,14 @@ def reproduce(tables, out, scale, jobs=1, progress=None):
         raise ValueError(f"{out}: holds runs of another scale; choose another --out")
     write_json(note, described)
     collect_data(out, scale, jobs, progress)
-    cells, results = cells_of_tables(tables, scale), {}
-    with worker_pool(jobs) as pool:
-        try:
-            waiting = {pool.submit(run_cell, cell, out, scale): cell for cell in cells}
-            for done in as_completed(waiting):
-                cell = waiting[done]
-                results[cell] = done.result()
-                print(f"{len(results)} of {len(cells)}: {cell.name}: ratio {results[cell]['flow_mse_ratio']:.3f}, "
-                      f"{results[cell]['train_seconds'] / 60:.1f} min")
-        except BaseException:  # an interrupt must not wait for the cells that run: their checkpoints are on disk
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
-    figures = summarise(results, scale)
+    cells = cells_of_tables(tables, scale)
+
+    def report(done, task, metrics):
+        print(f"{done} of {len(cells)}: {task[0].name}: ratio {metrics['flow_mse_ratio']:.3f}, "
+              f"{metrics['train_seconds'] / 60:.1f} min", flush=True)
+
+    results = run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs, report)
+    figures = summarise({cell: results[cell,] for cell in cells}, scale)
     if "optical-flow" in tables:
         figures.update(evaluation.evaluate_image_pairs(*_data(out / "test")))
         figures.update(optical_headlines(figures))
@@ -321,15 +335,7 @@ def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
     todo = [(planner, movers, seed, 0) for planner in PLANNERS for movers in OBJECTS for seed in range(scenes)]
     todo += [(planner, 0, seed, attempt) for planner in ("learned", "greedy") for seed in range(OBSTACLE_SCENES)
              for attempt in range(OBSTACLE_TRIES)]
-    with worker_pool(jobs) as pool:
-        try:
-            running = [pool.submit(run_scene, checkpoint, out, *each) for each in todo]
-            results = dict(zip(todo, (each.result() for each in running)))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
+    results = run_all(partial(run_scene, checkpoint, out), todo, jobs)
     curves = {(planner, movers): np.array([results[planner, movers, seed, 0]["distance_m"] for seed in range(scenes)])
               for planner in PLANNERS for movers in OBJECTS}
     return summarise_planning(results, curves), curves

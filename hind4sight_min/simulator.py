@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from . import worker_pool
-from .geometry import Camera, look_at, unproject
+from .geometry import Camera, look_at
 from .interactions import (OCCUPIED, Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
                            save_shard, standing, truth_path)
 from .objects import KINDS, TEXTURES, centred, draw_texture, prism, prism_mesh
@@ -267,14 +267,11 @@ class Arena:
                                           physicsClientId=client)
 
     def snapshot(self):
-        """The state of the world, for `restore`; forget it with `forget`."""
+        """The state of the world, for `restore`; Bullet keeps it until the arena is closed."""
         return self.bullet.saveState(physicsClientId=self._client)
 
     def restore(self, state):
         self.bullet.restoreState(state, physicsClientId=self._client)
-
-    def forget(self, state):
-        self.bullet.removeState(state, physicsClientId=self._client)
 
     # -- observations --
 
@@ -356,9 +353,9 @@ def occupied_cells(depth, empty_depth, camera, settings, threshold=OCCUPIED):
 
     depth, empty_depth (H, W) m; threshold: of `occupied_pixels`, m -> (rows, columns) bool.
     """
-    changed = standing(depth, empty_depth, camera, settings, threshold)
+    points, objects = standing(depth, empty_depth, camera, settings, threshold)
     occupied = np.zeros(grid_shape(settings), bool)
-    occupied.ravel()[cells_of(unproject(depth, camera)[changed][:, :2], settings)] = True
+    occupied.ravel()[cells_of(points[objects][:, :2], settings)] = True
     return occupied
 
 

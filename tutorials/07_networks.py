@@ -28,7 +28,7 @@ import lesson
 import numpy as np
 
 from hind4sight_min import evaluation, geometry, losses, networks, training
-from hind4sight_min.figures import PALETTE, _arrow, _blend, flow_to_rgb
+from hind4sight_min.figures import PALETTE, blend, draw_arrow, flow_to_rgb
 
 options = lesson.begin("07_networks")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -91,7 +91,7 @@ def predictions(run, pokes):
 
 
 def poke_arrow(panel, start, poke):
-    _arrow(panel, *geometry.project(np.array([[*start, 0.02], [*poke[:2], 0.02]]), camera))
+    draw_arrow(panel, *geometry.project(np.array([[*start, 0.02], [*poke[:2], 0.02]]), camera))
 
 
 one = data[np.array([ROW])]
@@ -146,7 +146,7 @@ print(f"4. Mean mask on the object that is poked {np.diag(on).mean():.2f}, on th
 figure, axes = plt.subplots(2, 4, figsize=(11, 4.7), layout="constrained")
 scene = data.rgb_before[SCENE] / 255
 for poke in range(4):
-    axes[0, poke].imshow(_blend(scene, masks[poke][..., 1:]))
+    axes[0, poke].imshow(blend(scene, masks[poke][..., 1:]))
     poke_arrow(axes[0, poke], starts[poke], pokes[poke])
     axes[0, poke].set(xticks=[], yticks=[])
     axes[0, poke].set_title(f"masks, if the poke is {np.degrees(angles[poke]):.0f}\u00b0", fontsize=11)

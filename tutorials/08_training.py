@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.animation import PillowWriter
 
 from hind4sight_min import evaluation, losses, networks, training
-from hind4sight_min.figures import PALETTE, TERMS, _blend, flow_to_rgb
+from hind4sight_min.figures import PALETTE, TERMS, blend, flow_to_rgb
 from hind4sight_min.geometry import project
 
 options = lesson.begin("08_training")
@@ -209,8 +209,8 @@ figure, axes = plt.subplots(len(SHOWN), len(columns) + 1, figsize=(11, 2.9), lay
 for i, line in enumerate(axes):
     for panel, column in zip(line, columns):
         at, masks, _ = snapshots[column]
-        panel_of(panel, _blend(pictures[i], masks[i][parts[i]][..., 1:]), f"step {at}" if i == 0 else "")
-    panel_of(line[-1], _blend(pictures[i], moved[i][..., None].astype(float)), "truth" if i == 0 else "")
+        panel_of(panel, blend(pictures[i], masks[i][parts[i]][..., 1:]), f"step {at}" if i == 0 else "")
+    panel_of(line[-1], blend(pictures[i], moved[i][..., None].astype(float)), "truth" if i == 0 else "")
     poke_on(line[0], i)
 figure.suptitle("Masks of two held-out pokes: first all a little, then hardly anything, then (part of) what moves",
                 fontsize=11)
@@ -238,7 +238,7 @@ writer = PillowWriter(fps=4)
 with writer.saving(figure, animation, dpi=70):
     for at, masks, flow in snapshots + snapshots[-1:] * 4:  # the last one stays for a while
         for i, (left, right) in enumerate(shown):
-            left.set_data(_blend(pictures[i], masks[i][parts[i]][..., 1:]))
+            left.set_data(blend(pictures[i], masks[i][parts[i]][..., 1:]))
             right.set_data(flow_to_rgb(flow[i][parts[i]], longest[i]))
         for mark in marks:
             mark.set_xdata([at, at])

@@ -127,9 +127,7 @@ rounds = []
 
 
 def remember(iteration, population, costs, mean, deviation):
-    back = 0.1 * np.stack([np.cos(population[:, 0, 2]), np.sin(population[:, 0, 2])], axis=1)
-    ends = np.stack([population[:, 0, :2] - back, population[:, 0, :2]])
-    rounds.append((*planning.places_on_table(ends, camera), costs))
+    rounds.append((*planning.arrows_of(population[:, 0], settings, camera), costs))
 
 
 found = planning.plan(rollout, view, goal, camera, settings, SEARCH, np.random.default_rng(0), remember)
