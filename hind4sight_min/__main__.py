@@ -123,7 +123,7 @@ def run_train(args):
             raise ValueError(f"{args.out}: exists already; --resume goes on with it")
         recipe = training.Recipe(steps=args.steps, batch=args.batch, learning_rate=args.learning_rate, seed=args.seed,
                                  depth_noise=args.depth_noise, sizes=Sizes(masks=args.masks, width=args.width),
-                                 ramp=args.ramp, weights={**training.WEIGHTS, **dict(args.weight)})
+                                 weights={**training.WEIGHTS, **dict(args.weight)})
         run = training.start_run(recipe, interactions)
         if args.start:
             start = training.load_run(args.start)
@@ -349,8 +349,6 @@ def build_parser():
     sub.add_argument("--learning-rate", type=float, default=recipe.learning_rate)
     sub.add_argument("--weight", type=term_weight, action="append", default=[], metavar="TERM=VALUE",
                      help=f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(recipe.weights)}")
-    sub.add_argument("--ramp", type=float, nargs=2, default=recipe.ramp, metavar=("FROM", "TO"),
-                     help="shares of the steps between which the 2D terms' weights grow from 0")
     sub.add_argument("--start", metavar="CHECKPOINT", help="begin with its parameters instead of random ones")
     sub.add_argument("--depth-noise", type=float, default=0.0, help="SD in m of the depth noise to train under")
     sub.add_argument("--masks", type=int, default=Sizes.masks, help="K, background included")

@@ -173,16 +173,38 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     return np.where(valid, np.maximum(noisy, DEPTH_UNIT), 0).astype(depth.dtype)
 
 
-def smooth_depth(depth, empty_depth):
-    """Take noise out of depth pictures: a bilateral filter on the difference to the empty arena. Not in the paper.
+SMOOTHING = 3, 3.0, 0.15, 0.02  # radius in px, and what counts as near: SDs in px, of colours in [0, 1], in m
 
-    In the difference the table is flat at 0 and objects are islands some cm high, so a filter that averages only
-    neighbours of like value, within 2.5 cm, halves noise of 1 cm and keeps most edges.
-    depth (..., H, W) m, 0 = missing, which stays; empty_depth (..., H, W) m, complete -> the same shape and dtype.
+
+def smooth_depth(depth, empty_depth, images):
+    """Take noise out of depth pictures with the help of the colours: a joint bilateral filter. Not in the paper.
+
+    In the difference to the empty arena the table is flat at 0 and objects are islands some cm high. There each pixel
+    becomes a mean of those around it, weighted by how near they are: in the picture, in colour, and in a first guess of
+    the difference, a bilateral filter of it alone. Of 1 cm of noise that leaves 2 mm on the table and 7 on objects.
+    depth (..., H, W) m, 0 = missing, which stays and counts for nobody; empty_depth (..., H, W) m, complete;
+    images (..., H, W, 3) uint8 -> the shape and dtype of depth.
     """
-    difference = np.where(depth > 0, depth - empty_depth, 0).astype(np.float32)
-    flat = difference.reshape(-1, *depth.shape[-2:])
-    smooth = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in flat]).reshape(depth.shape)
+    radius, px, colour, metres = SMOOTHING
+    height, width = depth.shape[-2:]
+    seen = (depth > 0).astype(np.float32).reshape(-1, height, width)
+    difference = seen * (depth - empty_depth).astype(np.float32).reshape(seen.shape)
+    guess = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in difference])
+    red_green_blue = np.moveaxis(images.reshape(-1, height, width, 3), -1, 0).astype(np.float32) / 255
+    total, weight = difference.copy(), seen.copy()
+    for dv in range(radius + 1):
+        for du in range(-radius if dv else 1, radius + 1):  # each pair of pixels once, for both
+            here = np.s_[:, :height - dv, max(0, -du):width - max(0, du)]
+            there = np.s_[:, dv:, max(0, du):width - max(0, -du)]
+            apart = np.square((guess[here] - guess[there]) / np.float32(metres))
+            for channel in red_green_blue:
+                apart += np.square((channel[here] - channel[there]) / np.float32(colour))
+            near = np.exp(-(apart + np.float32((dv ** 2 + du ** 2) / px ** 2)) / 2)
+            total[here] += near * difference[there]
+            total[there] += near * difference[here]
+            weight[here] += near * seen[there]
+            weight[there] += near * seen[here]
+    smooth = (total / np.maximum(weight, 1e-6)).reshape(depth.shape)
     return np.where(depth > 0, empty_depth + smooth, 0).astype(depth.dtype)
 
 

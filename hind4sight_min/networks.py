@@ -224,7 +224,8 @@ def forward_model(params, sizes, points, valid, pokes):
 
     # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (Adam
     # overshoots) would have no gradient left to come back with.
-    movers = MASK_BOUND * np.tanh(layer(params, "mask", h, relu=False) / MASK_BOUND)
+    logits = np.clip(layer(params, "mask", h, relu=False) / MASK_BOUND, -20, 20)  # tanh is flat there: no overflow
+    movers = MASK_BOUND * np.tanh(logits)
     masks = softmax(np.concatenate([onp.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, N, K)
     rotations, translations = _motions(params, h, masks, seen, local, valid)
     moved = transform_layer(local, masks, rotations, translations)  # Eq. (1)

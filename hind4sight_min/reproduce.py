@@ -43,8 +43,7 @@ MODELS = {
     "se3nets_9": ("SE3-Nets, 9 x 9 px", {"association": 9}),
     "se3nets_11": ("SE3-Nets, 11 x 11 px", {"association": 11}),
     "se3nets_3": ("SE3-Nets, 3 x 3 px (11 x 11 scaled)", {"association": 3}),
-    # Nothing but the 2D terms teaches this one, so they do not wait for the others.
-    "2d": ("2D loss", {"weights": _only("photometric", "flow_smoothness"), "ramp": (0.0, 0.02)}),
+    "2d": ("2D loss", {"weights": _only("photometric", "flow_smoothness")}),
     "3d": ("3D loss", {"weights": _only("chamfer", "distance_smoothness")}),
     "2d_3d": ("2D loss + 3D loss", {"weights": {**training.WEIGHTS, "inverse": 0.0}}),
     "full": ("full model", {}),

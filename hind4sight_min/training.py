@@ -47,7 +47,8 @@ class Batch:
     targets: onp.ndarray = None  # (B, n, 3) m: where each point goes; for SE3-Nets alone
 
 
-def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whole=False, truth=None, association=1):
+def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whole=False, truth=None, association=1,
+               image_noise=0.0):
     """The Batch of some rows of a data set.
 
     mirror, a bool or one per row, shows the arena mirrored at its plane x = 0, which costs no new poke: pictures flip
@@ -56,6 +57,7 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     a robot whose depth is noisy smooths it first.
     whole: the whole pictures instead of windows. truth (of these rows): adds the targets of SE3-Nets, with the
     association noise of Sec. IV-B, in which a point may be taken for any in an `association` px square around it.
+    image_noise: SD of Gaussian noise on the images of frame t, drawn from `rng`; see Recipe.
     """
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
@@ -69,7 +71,7 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     starts[mirror] *= [-1, 1]
     empty = onp.where(mirror[:, None, None], interactions.empty_depth[:, ::-1], interactions.empty_depth)
     if depth_noise:
-        depth = smooth_depth(add_depth_noise(depth, rng, depth_noise), empty)
+        depth = smooth_depth(add_depth_noise(depth, rng, depth_noise), empty, rgb)
     points, valid = points_and_validity(depth, camera)
     occupied = occupied_pixels(depth, empty)
     changed = most_changed(*points.reshape(2, len(rows), -1, 3), valid.all(axis=0).reshape(len(rows), -1))
@@ -84,6 +86,8 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
         targets = associated_targets(interactions, rows, mirror, points[0], depth[0], truth, association, rng)
         targets = cut(targets[None])[0].reshape(len(rows), -1, 3)
     images = cut(rgb).astype(onp.float32) / 255
+    if image_noise:
+        images[0] += onp.float32(image_noise) * rng.standard_normal(images[0].shape, onp.float32)
     points, valid, occupied = (value.reshape(2, len(rows), -1, *value.shape[4:])
                                for value in map(cut, (points, valid, occupied)))
     return Batch(*points, *valid, *losses.seen_in_both(*valid, *occupied), *images, *changed, pokes,
@@ -179,18 +183,23 @@ class Recipe:
     """Everything that decides a training run besides the data.
 
     steps: Adam steps. batch: interactions per step. learning_rate: peak; linear warm-up over `warmup` steps,
-    then a cosine to zero. ramp: the 2D terms grow from 0 to their weight between these shares of all steps (from a
-    cold start they teach the network to move nothing). depth_noise: SD in m of noise added to the depth, Sec. IV-B.
-    mirror: show half of the interactions mirrored. weights: one per term of Eq. (6).
+    then a cosine to zero. depth_noise: SD in m of noise added to the depth, Sec. IV-B. image_noise: SD of noise added
+    to the images I_t, in [0, 1]; see below. mirror: show half of the interactions mirrored. weights: one per term of
+    Eq. (6).
     association: 0, or the baseline SE3-Nets: supervised by the true motion of every point, each of which may be taken
     for any other in a square of so many pixels around it (1: exact; odd). Then the one weight is that of its loss.
+
+    A simulator's two pictures of a still thing are the same to the last bit, which no camera's are. Eq. (3) has a kink
+    there: to move all still edges a little costs more than to move the object gains, and a new network, whose masks
+    are everywhere, learns to move nothing. Noise of less than one grey level of 255 rounds the kink off. I_{t+1} gets
+    none: warping would smooth it, and so reward motion.
     """
     steps: int = 3000
     batch: int = 16
     learning_rate: float = 2e-3
     warmup: int = 50
-    ramp: tuple = (0.2, 0.6)
     depth_noise: float = 0.0
+    image_noise: float = 0.003
     seed: int = 0
     mirror: bool = True
     weights: dict = field(default_factory=lambda: dict(WEIGHTS))
@@ -198,7 +207,6 @@ class Recipe:
     association: int = 0
 
     def __post_init__(self):
-        object.__setattr__(self, "ramp", tuple(self.ramp))
         if self.association < 0 or self.association and self.association % 2 == 0:
             raise ValueError(f"association: expected 0 or an odd number of pixels, got {self.association}")
         for name in ("steps", "batch"):
@@ -206,8 +214,9 @@ class Recipe:
                 raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)}")
         if not 0 < self.learning_rate < float("inf"):
             raise ValueError(f"learning_rate: expected a finite number > 0, got {self.learning_rate}")
-        if not (len(self.ramp) == 2 and 0 <= self.ramp[0] < self.ramp[1]):
-            raise ValueError(f"ramp: expected two shares of the steps, 0 <= from < to, got {self.ramp}")
+        for name in ("depth_noise", "image_noise"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"{name}: expected a finite number >= 0, got {getattr(self, name)}")
         terms = ASSOCIATION_WEIGHTS if self.association else WEIGHTS
         if set(self.weights) != set(terms) or not all(0 <= value < float("inf") for value in self.weights.values()):
             raise ValueError(f"weights: expected a finite number >= 0 for each of {sorted(terms)}, got {self.weights}")
@@ -217,13 +226,6 @@ def learning_rate(recipe, step):
     """Linear warm-up, then a cosine to zero."""
     warm = min(1.0, (step + 1) / max(recipe.warmup, 1))
     return recipe.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))
-
-
-def weights_at(recipe, step):
-    """The weights of Eq. (6) at a step: the 2D terms ramp up."""
-    share = float(onp.interp(step / recipe.steps, recipe.ramp, (0.0, 1.0)))
-    return {name: value * (share if name in ("photometric", "flow_smoothness") else 1.0)
-            for name, value in recipe.weights.items()}
 
 
 @dataclass
@@ -281,11 +283,12 @@ def rows_of_step(recipe, count, step):
 CHUNK = 8  # interactions per gradient: enough of them to hide autograd's overhead per operation
 
 
-def chunk_gradient(interactions, truth, mirror, noise_seed, weights, vector, layout, recipe):
+def chunk_gradient(interactions, truth, mirror, noise_seed, vector, layout, recipe):
     """`batch_gradient` of a few interactions, weighted by their share of the batch; runs in a worker process."""
     rows, rng = onp.arange(len(interactions)), onp.random.default_rng(noise_seed)
-    batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng, truth=truth, association=recipe.association)
-    terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, weights)
+    batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng, truth=truth, association=recipe.association,
+                       image_noise=recipe.image_noise)
+    terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, recipe.weights)
     share = len(rows) / recipe.batch
     return {name: share * value for name, value in terms.items()}, onp.float32(share) * gradient
 
@@ -314,10 +317,10 @@ def training_step(interactions, run, gradients, truth=None):
     """
     recipe = run.recipe
     rows, mirror, rng = rows_of_step(recipe, len(interactions), run.step)
-    weights, rate = weights_at(recipe, run.step), learning_rate(recipe, run.step)
+    rate = learning_rate(recipe, run.step)
     chunks = [slice(i, i + CHUNK) for i in range(0, recipe.batch, CHUNK)]
     parts = gradients([(interactions[rows[chunk]], truth and truth[rows[chunk]], mirror[chunk], rng.integers(2 ** 32),
-                        weights, run.vector, run.layout, recipe) for chunk in chunks])
+                        run.vector, run.layout, recipe) for chunk in chunks])
     gradient = sum(part[1] for part in parts)
     if not onp.isfinite(gradient).all():
         raise FloatingPointError(f"the gradient is not finite at step {run.step}")

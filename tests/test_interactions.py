@@ -709,32 +709,59 @@ def test_association_refuses_even_and_empty_windows(window):
         associate_with_noise(np.ones((4, 5)), np.random.default_rng(0), window)
 
 
-def test_smooth_depth_against_the_bilateral_sum():
+def test_smooth_depth_against_the_sum_by_hand():
     rng = np.random.default_rng(2)
     empty = np.float32(0.8) + np.linspace(0, 0.2, 12 * 16, dtype=np.float32).reshape(12, 16)
-    depth = empty - 0.04 * (rng.random((3, 12, 16)) < 0.3) + rng.normal(0, 0.01, (3, 12, 16))
-    difference = depth - empty
-    v, u = np.mgrid[-2:3, -2:3]
-    near = v ** 2 + u ** 2 <= 4  # the filter's neighbourhood is a disc
-    found = smooth_depth(depth, empty)
-    for i, row, column in ((0, 4, 5), (1, 7, 9), (2, 2, 13)):
-        patch = difference[i, row - 2:row + 3, column - 2:column + 3]
-        weights = near * np.exp(-(v ** 2 + u ** 2) / (2 * 1.5 ** 2)
-                                - (patch - difference[i, row, column]) ** 2 / (2 * 0.025 ** 2))
-        expected = empty[row, column] + (weights * patch).sum() / weights.sum()
+    depth = empty - 0.04 * (rng.random((2, 12, 16)) < 0.3) + rng.normal(0, 0.01, (2, 12, 16))
+    depth[0, 4, 6] = 0  # missing
+    images = rng.integers(0, 90, (2, 12, 16, 3)).astype(np.uint8)
+    difference = np.where(depth > 0, depth - empty, 0)
+    v, u = np.mgrid[:12, :16]
+
+    def weighted(values, weights):
+        return (weights * values).sum() / weights.sum()
+
+    guess = np.empty_like(difference)  # a bilateral filter; its neighbourhood is a disc, the picture goes on mirrored
+    for i in range(2):
+        padded = np.pad(difference[i], 2, mode="reflect")
+        for row, column in np.ndindex(12, 16):
+            patch, (dv, du) = padded[row:row + 5, column:column + 5], np.mgrid[-2:3, -2:3]
+            weights = np.exp(-(dv ** 2 + du ** 2) / (2 * 1.5 ** 2)
+                             - (patch - difference[i, row, column]) ** 2 / (2 * 0.025 ** 2))
+            guess[i, row, column] = weighted(patch, weights * (dv ** 2 + du ** 2 <= 4))
+    found = smooth_depth(depth, empty, images)
+    assert found.dtype == depth.dtype and found[0, 4, 6] == 0
+    for i, row, column in ((0, 4, 5), (1, 7, 9), (1, 11, 0), (0, 0, 14)):
+        dv, du = v - row, u - column
+        colour = ((images[i] / 255.0 - images[i, row, column] / 255.0) ** 2).sum(axis=2)
+        weights = np.exp(-(dv ** 2 + du ** 2) / (2 * 3.0 ** 2) - colour / (2 * 0.15 ** 2)
+                         - (guess[i] - guess[i, row, column]) ** 2 / (2 * 0.02 ** 2))
+        weights *= (np.maximum(abs(dv), abs(du)) <= 3) & (depth[i] > 0)
+        expected = empty[row, column] + weighted(difference[i], weights)
         assert abs(found[i, row, column] - expected) < 2e-5 < 1e-3 < abs(found[i, row, column] - depth[i, row, column])
 
 
-def test_smooth_depth_halves_noise_keeps_edges_missing_pixels_and_dtype():
+def test_smooth_depth_takes_noise_keeps_edges_missing_pixels_and_dtype():
     rng = np.random.default_rng(3)
     empty = np.full((2, 48, 64), 0.9, np.float32)
-    clean = empty.copy()
+    clean, images = empty.copy(), np.full((2, 48, 64, 3), 140, np.uint8)
     clean[:, 20:30, 20:30] -= 0.06
+    images[:, 20:30, 20:30] = (200, 30, 30)
     noisy = add_depth_noise(clean, rng, 0.01)
     noisy[0, 5, 5] = 0
-    smooth = smooth_depth(noisy, empty)
+    smooth = smooth_depth(noisy, empty, images)
     assert smooth.dtype == np.float32 and smooth[0, 5, 5] == 0 and (smooth > 0).sum() == smooth.size - 1
     rest = noisy > 0
-    assert (smooth - clean)[rest].std() < 0.5 * (noisy - clean)[rest].std()
+    assert (smooth - clean)[rest].std() < 0.25 * (noisy - clean)[rest].std()
     edge = np.s_[:, 22:28, 20]  # the object's side columns do not flow out onto the table
-    assert np.abs(smooth[edge] - clean[edge]).mean() < 0.012
+    assert np.abs(smooth[edge] - clean[edge]).mean() < 0.006
+
+
+def test_smooth_depth_without_noise_changes_little():
+    empty = np.full((24, 32), 0.9, np.float32)
+    images = np.full((24, 32, 3), 140, np.uint8)
+    np.testing.assert_allclose(smooth_depth(empty, empty, images), empty, atol=1e-7)
+    depth = empty.copy()
+    depth[8:16, 8:16] -= 0.06
+    images[8:16, 8:16] = (200, 30, 30)
+    np.testing.assert_allclose(smooth_depth(depth, empty, images), depth, atol=1e-3)

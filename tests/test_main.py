@@ -151,10 +151,9 @@ def test_weights_and_starting_point(tmp_path, capsys):
     first, second, third = (tmp_path / f"{name}.npz" for name in "abc")
     assert run("train", data_small() / "train", first, *TRAIN) == 0
     assert run("train", data_small() / "train", second, *TRAIN, "--start", first, "--weight", "chamfer=0",
-               "--weight", "photometric=0.7", "--ramp", 0, 0.5, "--learning-rate", 1e-9) == 0
+               "--weight", "photometric=0.7", "--learning-rate", 1e-9) == 0
     went_on = training.load_run(second)
     assert went_on.recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
-    assert went_on.recipe.ramp == (0, 0.5)
     np.testing.assert_allclose(went_on.vector, training.load_run(first).vector, atol=1e-7)  # hardly a step away
     capsys.readouterr()
     one_line(capsys, run("train", data_small() / "train", third, *TRAIN, "--width", 12, "--start", first), "a.npz")
@@ -162,7 +161,6 @@ def test_weights_and_starting_point(tmp_path, capsys):
         with pytest.raises(SystemExit) as stop:
             run("train", data_small() / "train", third, "--weight", wrong)
         one_line(capsys, stop.value.code, "weight")
-    one_line(capsys, run("train", data_small() / "train", third, "--ramp", 0.5, 0.5), "ramp")
     one_line(capsys, run("train", data_small() / "train", third, "--weight", "chamfer=-1"), "weights")
 
 

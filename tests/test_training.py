@@ -100,12 +100,12 @@ def test_the_same_seed_gives_the_same_run_on_any_number_of_processes():
 
 
 def test_the_gradient_of_a_batch_is_that_of_its_chunks(monkeypatch):
-    data, recipe = pokes_seen(), replace(TINY, batch=7, steps=1)
+    data, recipe = pokes_seen(), replace(TINY, batch=7, steps=1, image_noise=0.0)  # each chunk draws its own noise
     whole = train(data, start_run(recipe, data))
     monkeypatch.setattr(training, "CHUNK", 3)
     chunks = train(data, start_run(recipe, data))
     difference = np.linalg.norm(chunks.first_moment - whole.first_moment)
-    assert difference < 1e-3 * np.linalg.norm(whole.first_moment)
+    assert difference < 5e-3 * np.linalg.norm(whole.first_moment)  # rounding decides on which side of a kink it is
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path):
@@ -132,6 +132,38 @@ def test_training_with_depth_noise_differs_and_repeats():
     first, second = (train(data, start_run(noisy, data)).vector for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert not np.array_equal(first, train(data, start_run(TINY, data)).vector)
+
+
+def test_image_noise_is_on_the_images_of_frame_t_and_on_nothing_else():
+    data = pokes_seen()
+    plain = make_batch(data, np.arange(7), whole=True)
+    noisy, again = (make_batch(data, np.arange(7), whole=True, rng=np.random.default_rng(5), image_noise=0.01)
+                    for _ in range(2))
+    noise = noisy.images - plain.images
+    assert noise.dtype == np.float32 and abs(noise.mean()) < 1e-3 and noise.std() == pytest.approx(0.01, rel=0.05)
+    for name in ("next_images", "points", "shared", "before", "pokes"):
+        np.testing.assert_array_equal(getattr(noisy, name), getattr(plain, name))
+    np.testing.assert_array_equal(noisy.images, again.images)
+
+
+def test_image_noise_lets_a_motion_begin():
+    """Three still edges and one that moved: without noise the least common motion costs, with noise it pays."""
+    count, brightness = 4000, 0.3 * np.arange(6, dtype=np.float32)[None, None, :, None]
+    still, moved = np.tile(brightness, (1, 3, 1, 1)), np.tile(brightness - 0.3, (1, 1, 1, 1))  # a pixel to the right
+    image = np.concatenate([still, brightness], axis=1).repeat(count, axis=0)
+    next_image = np.concatenate([still, moved], axis=1).repeat(count, axis=0)
+    rng, valid = np.random.default_rng(0), np.ones((count, 4, 6), bool)
+    valid[..., [0, -1]] = False  # these may leave the picture
+
+    def loss(step, noise):
+        flow = np.zeros((count, 4, 6, 2), np.float32)
+        flow[..., 0] = step
+        return np.mean(losses.photometric_loss(image + noise, next_image, flow, valid.reshape(count, 24)))
+
+    none, noise = 0 * image, np.float32(0.003) * rng.standard_normal(image.shape, np.float32)
+    for step in (1 / 64, 1 / 16):
+        assert loss(step, none) > loss(0, none) + 0.01 * step and loss(-step, none) > loss(0, none) + 0.01 * step
+    assert loss(1 / 256, noise) < loss(0, noise) - 1e-3
 
 
 def test_adam_against_its_formula():
@@ -222,16 +254,6 @@ def test_a_window_is_cut_out_of_every_picture():
 def test_mirroring_needs_a_symmetric_camera():
     with pytest.raises(ValueError, match="mirror"):
         make_batch(pokes_seen(x=0.1), np.arange(2), mirror=True)
-
-
-def test_weight_schedule_ramps_the_2d_terms_only():
-    recipe = replace(TINY, steps=100, ramp=(0.2, 0.6))
-    for step, share in ((0, 0.0), (20, 0.0), (40, 0.5), (60, 1.0), (99, 1.0)):
-        weights = training.weights_at(recipe, step)
-        for name, value in training.WEIGHTS.items():
-            expected = share * value if name in ("photometric", "flow_smoothness") else value
-            assert weights[name] == pytest.approx(expected), (step, name)
-    assert set(weights) == set(losses.PAPER_WEIGHTS)
 
 
 def test_learning_rate_schedule():

@@ -285,8 +285,8 @@ figure.suptitle("Chamfer brings the object near and then fades; there the pictur
 lesson.keep(options, figure, "gradient")
 
 # %% [markdown]
-# So the two losses divide the work, and training lets them: the 2D terms of Eq. (6) start at a weight of 0 and grow
-# while the 3D terms already pull (`training.Recipe.ramp`).
+# So the two losses divide the work. (At no motion at all something else happens, and a little noise on the images
+# helps: `training.Recipe.image_noise`, tutorial 08.)
 #
 # **Now change this:** set `ROW = 173`. The lowest photometric loss is then in a corner of the landscape, far from the
 # truth, and a check fails. What happens to the object's pixels there? (Look at `in_view`.) And what would a network

@@ -343,6 +343,11 @@ step_up, high = np.array([[0, 0, 1, 1.0]]), np.array([[0, 3, 3, 3.0]])  # D_{P'-
 lesson.check("Eq. (5) by hand: D_{P'->P} jumps by 1 at the edge in I, D_{P->P'} by 3 in a flat I+",
              float(losses.distance_smoothness_loss(step_up, high, edge, 0 * edge, all_seen, all_seen)[0]),
              3 + np.exp(-2), within=1e-4)
+slopes = grad(lambda maps: anp.sum(losses.distance_smoothness_loss(maps[0], maps[1], edge, 0 * edge, all_seen,
+                                                                   all_seen)))(np.stack([step_up, high]))[:, 0]
+for name, map_, column, wanted in (("D_{P'->P}", 0, 2, np.exp(-2)), ("D_{P->P'}", 1, 1, 1.0)):
+    lesson.check(f"gradient of Eq. (5) to {name} beyond the jump", float(slopes[map_, column]), wanted, within=1e-4)
+    lesson.check("and before it", float(slopes[map_, column - 1]), -wanted, within=1e-4)
 lesson.check("L_fs without motion", costs["no motion"], 0.0, within=1e-6)
 lesson.check("L_fs spilled / true, mean over the group", float(spill_ratio[usual]), above=8)
 lesson.check("the same as the paper prints it", float(spill_ratio[0]), above=1, below=3)

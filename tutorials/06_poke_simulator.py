@@ -250,6 +250,10 @@ lesson.check("shortest path of a finger [m]", float(length.min()), above=least -
 lesson.check("longest path of a finger [m]", float(length.max()), below=most + 1e-4)
 hit = grids.reshape(len(grids), -1)[np.arange(len(grids)), interactions.cells_of(recorded.pokes[:, :2], settings)]
 lesson.check("share of targets on an occupied cell", float(hit.mean()), 1, within=1e-9)
+x, y, angle = recorded.pokes[0]
+beside = np.float32([[[x - 0.05 * np.sin(angle), y + 0.05 * np.cos(angle), 0]]])
+lesson.check("5 cm to the left of the target, in the poke's frame: distance to (0, 0.05, 0) [m]",
+             float(np.linalg.norm(networks.poke_frame(beside, recorded.pokes[:1]) - [0, 0.05, 0])), 0, within=1e-5)
 turned = np.array([[0.1, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]])  # moved by 10 cm, turned by 90 degrees
 flow = interactions.true_scene_flow(np.array([[[0.02, 0, 0.01]]]), np.array([[1]]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]),
                                     turned)

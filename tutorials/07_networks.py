@@ -308,6 +308,10 @@ for name in ("encoder_1", "encoder_2"):
     by_hand = np.maximum(by_hand @ shipped.params[name + "_w"] + shipped.params[name + "_b"], 0)
 lesson.check("encoder, largest difference to two layers by hand",
              float(np.abs(networks.encode(shipped.params, batch.points) - by_hand).max()), below=1e-4)
+here = batch.valid[0]
+lesson.check("state embedding, largest difference to the mean over the points with depth",
+             float(np.abs(networks.state_embedding(by_hand, batch.valid)[0] - by_hand[0, here].mean(axis=0)).max()),
+             below=1e-5)
 lesson.check("shuffled points, largest difference [m]", float(order_matters), below=1e-4)
 x, y, angle = data.pokes[ROW]
 beyond = np.float32([[[x + 0.1 * np.cos(angle), y + 0.1 * np.sin(angle), 0]]])

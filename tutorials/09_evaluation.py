@@ -153,7 +153,7 @@ for name in ("flow_mse_ratio", "mask_iou", "inverse_target_cm"):
     print(f"   {name:22s}", "  ".join(f"{each[name]:5.2f}" for each in noisy))
 rng = np.random.default_rng(0)
 rough = interactions.add_depth_noise(data.depth_before, rng, 0.01)
-smooth = interactions.smooth_depth(rough, data.empty_depth)
+smooth = interactions.smooth_depth(rough, data.empty_depth, data.rgb_before)
 left_of_noise = [float(np.std(depth - data.depth_before)) for depth in (rough, smooth)]
 print(f"   noise of 1 cm before smoothing {100 * left_of_noise[0]:.2f} cm, after {100 * left_of_noise[1]:.2f} cm")
 
@@ -182,14 +182,14 @@ lesson.keep(options, figure, "noise")
 # order of the pokes; the full model gets two.
 
 # %%
-STEPS, SEEDS = (100, (0,)) if options.quick else (110, (0, 1))
+STEPS, SEEDS = 200, (0,) if options.quick else (0, 1)
 NOISE = "clean"  # or "noisy": see the experiment below
 train, _ = lesson.pokes("train")
 small = {}
 for model, seeds in (("2d", (0,)), ("3d", (0,)), ("full", SEEDS)):
     for seed in seeds:
         recipe = reproduce.recipe_of(reproduce.Cell(model, NOISE, seed), reproduce.Scale(steps=STEPS))
-        recipe = replace(recipe, batch=4, warmup=20, ramp=recipe.ramp if model == "2d" else (0.6, 1.2))  # little time
+        recipe = replace(recipe, batch=4, warmup=20)  # little time
         trained = training.train(train, training.start_run(recipe, train))
         small[model, seed] = evaluation.evaluate(trained, data, truth, depth_noise=reproduce.NOISES[NOISE])
         found = small[model, seed]
@@ -211,16 +211,16 @@ for seed in SEEDS:
     axes[1].plot([], [], "o", color=PALETTE[(5, 6)[seed]], label=f"seed {seed}")
 axes[1].plot([], [], "k--", linewidth=1, label="shipped model")
 axes[1].legend(fontsize=9, loc="center left")
-figure.suptitle(f"After {STEPS} steps: 2D alone learns no motion; 3D and full differ in flow no more than two seeds",
+figure.suptitle(f"After {STEPS} steps: 2D alone has hardly begun; 3D and full are far from what they can be",
                 fontsize=11)
 lesson.keep(options, figure, "ablation")
 
 # %% [markdown]
-# What does this small budget show? That the 2D terms alone do not get off the ground from a cold start: their ratio
-# stays at that of no motion. And that only the full model learns the heat-maps; the other two have no loss for
-# them. What does it *not* show? Whether the full model's flow is better than that of the 3D terms. Their difference
-# is no larger than that between two seeds, and all are far from the shipped model. For that question there is
-# `hind4sight reproduce ablation`: thousands of steps, three seeds per model, a mean and a standard deviation.
+# What does this small budget show? That the 2D terms alone get off the ground last: pictures say little while the
+# motion is far from the truth (tutorial 04). And that only the full model learns the heat-maps; the other two have no
+# loss for them. What does it *not* show? Whose flow is best in the end. All are far from the shipped model, and in its
+# cold start the full model has the 2D terms to carry. For that question there is `hind4sight reproduce ablation`:
+# thousands of steps, three seeds per model, a mean and a standard deviation.
 #
 # **Now change this:** set `NOISE = "noisy"`, which trains and evaluates with 1 cm of depth noise. In the paper's
 # Table I the 3D terms alone fail there. Can this budget tell? And how do the ratios compare with the shipped
@@ -262,7 +262,7 @@ lesson.check("shipped: median target error [cm]", metrics["inverse_target_cm"], 
 lesson.check("shipped: ratio at 2 cm of noise / without", noisy[-1]["flow_mse_ratio"] / noisy[0]["flow_mse_ratio"],
              above=1.5)
 lesson.check("mean of ratios / pooled ratio", float(ratios.mean() * motions.sum() / errors.sum()), above=1.2)
-lesson.check("2D terms alone: ratio", small["2d", 0]["flow_mse_ratio"], above=0.95)
+lesson.check("2D terms alone: ratio", small["2d", 0]["flow_mse_ratio"], above=0.8)
 lesson.check("full model, target error / that of the 3D terms, which have no loss for it",
              small["full", 0]["inverse_target_cm"] / small["3d", 0]["inverse_target_cm"], below=0.5)
 lesson.check("full model: ratio", small["full", 0]["flow_mse_ratio"], below=0.85)
