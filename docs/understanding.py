@@ -10,18 +10,18 @@ import argparse
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
-from results import replaced
-from scipy.spatial.transform import Rotation
-
-from hind4sight_min import evaluation, losses, training
+from hind4sight_min import evaluation, losses, training  # before NumPy: it sets the number of BLAS threads
 from hind4sight_min.__main__ import data_small
 from hind4sight_min.figures import blend, draw_arrow, flow_to_rgb, save_figure, show_image
 from hind4sight_min.geometry import optical_flow, project
 from hind4sight_min.interactions import load_interactions, load_truth, write_text
 from hind4sight_min.objects import HELD_OUT
 from hind4sight_min.simulator import Settings, collect
+
+import numpy as np  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from results import replaced  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
 
 DOCS = Path(__file__).resolve().parent
 BEGIN, END = "<!-- norms: written by docs/understanding.py -->", "<!-- /norms -->"

@@ -11,10 +11,10 @@ Equations:
 - Sec. IV-B, depth noise: `interactions.add_depth_noise`, `interactions.smooth_depth`; tests/test_interactions.py
 - Sec. IV-F, the ablation: `reproduce.MODELS`, `reproduce.recipe_of`; tests/test_reproduce.py
 
-Time: 25 s. Pictures: 09_errors.png, 09_noise.png, 09_ablation.png.
+Time: 35 s. Pictures: 09_errors.png, 09_noise.png, 09_ablation.png.
 
 Last lines to expect:
-   full model: ratio: expected below 0.85, got 0.4311
+   full model: ratio: expected below 0.85, got 0.4174
 09_evaluation: all checks passed
 """
 # %% [markdown]
@@ -169,7 +169,7 @@ for panel, name, baseline, title in (
         panel.legend(fontsize=9, loc="upper left")
     panel.set(xlabel="depth noise, SD [cm]", ylim=(0, 1.3 * (baseline or 0.77)))
     panel.set_title(title, fontsize=10)
-figure.suptitle("Trained without noise: errors grow with it; at 2 cm the inverse model is little better than chance",
+figure.suptitle("Trained without noise: half a centimetre hardly matters to the flow, but to the inverse model; 2 cm to both",
                 fontsize=11)
 lesson.keep(options, figure, "noise")
 
@@ -255,7 +255,7 @@ lesson.check("one start cell, one target cell four to its right: direction [degr
 lesson.check("the same: x of the target, column 14 of 2.5 cm, its middle [m]", float(peak[0]), 14.5 * 0.025 - 0.25,
              within=1e-6)
 lesson.check("chance: median direction error [degrees]", metrics["inverse_direction_chance_deg"], 90, within=30)
-lesson.check("smoothing leaves of the noise", left_of_noise[1] / left_of_noise[0], above=0.2, below=0.8)
+lesson.check("smoothing leaves of the noise", left_of_noise[1] / left_of_noise[0], above=0.1, below=0.5)
 lesson.check("shipped: ratio", metrics["flow_mse_ratio"], below=0.25)
 lesson.check("shipped: IoU of the masks", metrics["mask_iou"], above=0.6)
 lesson.check("shipped: median target error [cm]", metrics["inverse_target_cm"], below=4)
