@@ -169,7 +169,7 @@ for panel, name, baseline, title in (
         panel.legend(fontsize=9, loc="upper left")
     panel.set(xlabel="depth noise, SD [cm]", ylim=(0, 1.3 * (baseline or 0.77)))
     panel.set_title(title, fontsize=10)
-figure.suptitle("Trained without noise: half a centimetre hardly matters to the flow, but to the inverse model; 2 cm to both",
+figure.suptitle("Trained without noise: half a centimetre hardly matters to the flow, but to the inverse model",
                 fontsize=11)
 lesson.keep(options, figure, "noise")
 
