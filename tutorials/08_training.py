@@ -66,7 +66,7 @@ print(f"1. {recipe.steps} steps of {recipe.batch} pokes, {recipe.steps * recipe.
 # that the model looks at by a hundredth of a pixel along the poke, and see what the photometric loss, Eq. (3), says
 # to it. The object that was poked gains, as it did move that way. Everything else loses.
 #
-# **Predict before you run:** most of what is not the object is bare table. Which wins, for motions as small as that?
+# Guess first: most of what is not the object is bare table. Which wins, for motions as small as that?
 
 # %%
 SHIFTS = np.array([-0.05, -0.02, -0.01, -0.005, 0, 0.002, 0.005, 0.01, 0.02, 0.05])  # px
