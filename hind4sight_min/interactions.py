@@ -189,17 +189,17 @@ def smooth_depth(depth, empty_depth, images):
     height, width = depth.shape[-2:]
     seen = (depth > 0).astype(np.float32).reshape(-1, height, width)
     difference = seen * (depth - empty_depth).astype(np.float32).reshape(seen.shape)
-    guess = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in difference])
-    red_green_blue = np.moveaxis(images.reshape(-1, height, width, 3), -1, 0).astype(np.float32) / 255
+    guess = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in difference]) / np.float32(metres)
+    red_green_blue = np.moveaxis(images.reshape(-1, height, width, 3), -1, 0) / np.float32(255 * colour)
     total, weight = difference.copy(), seen.copy()
     for dv in range(radius + 1):
         for du in range(-radius if dv else 1, radius + 1):  # each pair of pixels once, for both
             here = np.s_[:, :height - dv, max(0, -du):width - max(0, du)]
             there = np.s_[:, dv:, max(0, du):width - max(0, -du)]
-            apart = np.square((guess[here] - guess[there]) / np.float32(metres))
-            for channel in red_green_blue:
-                apart += np.square((channel[here] - channel[there]) / np.float32(colour))
-            near = np.exp(-(apart + np.float32((dv ** 2 + du ** 2) / px ** 2)) / 2)
+            apart = np.float32((dv ** 2 + du ** 2) / px ** 2)  # squared, in standard deviations
+            for guide in (guess, *red_green_blue):
+                apart = apart + np.square(guide[here] - guide[there])
+            near = np.exp(-apart / 2)
             total[here] += near * difference[there]
             total[there] += near * difference[here]
             weight[here] += near * seen[there]

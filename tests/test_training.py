@@ -146,6 +146,13 @@ def test_image_noise_is_on_the_images_of_frame_t_and_on_nothing_else():
     np.testing.assert_array_equal(noisy.images, again.images)
 
 
+@pytest.mark.parametrize("name", ["depth_noise", "image_noise"])
+@pytest.mark.parametrize("bad", [-0.001, np.inf, np.nan])
+def test_recipe_refuses_bad_noise(name, bad):
+    with pytest.raises(ValueError, match=name):
+        replace(TINY, **{name: bad})
+
+
 def test_image_noise_lets_a_motion_begin():
     """Three still edges and one that moved: without noise the least common motion costs, with noise it pays."""
     count, brightness = 4000, 0.3 * np.arange(6, dtype=np.float32)[None, None, :, None]
