@@ -114,13 +114,14 @@ def floors(rounds, batch_size=8):
 
     def network(vector):
         params = training.unflatten(vector, run.layout)
-        prediction, _, heatmaps = training.run_model(params, sizes, batch, data.camera)
+        prediction, _ = training.run_forward_model(params, sizes, batch, data.camera)
+        heatmaps = training.run_inverse_model(params, batch)
         seen = networks.state_embedding(networks.encode(params, batch.next_points), batch.next_valid)
         return sum((value * value).sum() for value in (prediction.points, prediction.embedding, seen, *heatmaps))
 
     pairs = products_of(network, run.vector)
     trained = training.load_run(data_small() / "checkpoint.npz")
-    predicted = training.run_model(trained.params, trained.recipe.sizes, batch, data.camera)[0].points
+    predicted = training.run_forward_model(trained.params, trained.recipe.sizes, batch, data.camera)[0].points
 
     def bare_products():
         for a, b in pairs:

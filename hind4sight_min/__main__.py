@@ -149,7 +149,7 @@ def train_and_save(run, interactions, path, jobs):
     def on_epoch(run):
         entry = run.log[-1]
         print(f"epoch {entry['epoch']:.0f}, step {entry['step']:.0f}: "
-              + ", ".join(f"{name} {entry[name]:.4g}" for name in run.recipe.weights), flush=True)
+              + ", ".join(f"{name} {entry[name]:.4g}" for name in run.recipe.weights if name in entry), flush=True)
         write_log(path.with_suffix(".csv"), run.log)
 
     seconds = training.train_saving(interactions, run, path, jobs=jobs, on_epoch=on_epoch, on_step=on_step)

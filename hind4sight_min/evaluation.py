@@ -11,7 +11,7 @@ from .geometry import optical_flow
 from .interactions import cell_centres, points_and_validity, true_scene_flow
 from .networks import windows
 from .ops import softmax
-from .training import make_batch, run_model
+from .training import make_batch, run_forward_model, run_inverse_model
 
 PEAK = 0.08  # m; how far from its best cell the end map's mean looks: on validation pokes 1.9 cm off, the best cell 2.5
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
@@ -26,7 +26,8 @@ def predict(run, interactions, rows, depth_noise=0.0):
     camera = interactions.camera
     batch, whole = (make_batch(interactions, rows, depth_noise=depth_noise, rng=np.random.default_rng([0, rows[0]]),
                                whole=whole) for whole in (False, True))
-    prediction, flow, heatmaps = run_model(run.params, run.recipe.sizes, batch, camera)
+    prediction, flow = run_forward_model(run.params, run.recipe.sizes, batch, camera)
+    heatmaps = run_inverse_model(run.params, batch)
     picture = (len(rows), camera.height, camera.width)
     background = np.eye(run.recipe.sizes.masks, dtype=np.float32)[0]
     points, masks, pixels = (np.empty(picture + (size,), np.float32) for size in (3, len(background), 2))

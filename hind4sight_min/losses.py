@@ -173,9 +173,9 @@ def full_loss(terms, weights):
     """Paper: Eq. (6), Sec. III-F.  L = lambda_1 L_3D + lambda_2 L_2D + lambda_3 L_inv, averaged over the batch.
 
     L_3D = L_CD + L_ds and L_2D = L_rec + L_fs; with a weight per term, so that an ablation is a zero.
-    terms: dict of (B,); weights: dict of floats; both with the keys of PAPER_WEIGHTS -> scalar.
+    terms: dict of (B,); weights: dict of floats; both with the same keys -> scalar.
     """
-    if set(terms) != set(weights):
+    if set(terms) != set(weights) or not terms:
         raise ValueError(f"weights: expected the keys {sorted(terms)}, got {sorted(weights)}")
     total = sum(weights[name] * terms[name] for name in terms)  # Eq. (6)
     return np.sum(total) / float(len(total))

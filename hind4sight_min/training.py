@@ -6,6 +6,7 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 
 import autograd.numpy as np
 import numpy as onp
@@ -111,38 +112,47 @@ def associated_targets(interactions, rows, mirror, points, depth, truth, window,
     return targets
 
 
-def run_model(params, sizes, batch, camera):
-    """The whole model on a batch -> (Prediction, optical flow (B, h, w, 2) px, (start, end) heat-map logits).
-
-    Paper: Fig. 3.
-    """
+def run_forward_model(params, sizes, batch, camera):
+    """What the poke does to a batch -> (Prediction, optical flow (B, h, w, 2) px). Paper: Fig. 3."""
     prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
     flow = optical_flow(batch.points, prediction.points, camera)  # the projection layer, Sec. III-C
-    flow = np.reshape(flow, batch.images.shape[:3] + (2,))
-    return prediction, flow, inverse_model(params, batch.before, batch.after, batch.change, batch.cells)
+    return prediction, np.reshape(flow, batch.images.shape[:3] + (2,))
 
 
-def loss_terms(params, sizes, batch, camera):
-    """All terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS; for a batch with targets, the one
-    term of SE3-Nets.
+def run_inverse_model(params, batch):
+    """Which poke it was -> (start, end) heat-map logits, (B, cells) each. Paper: Fig. 3."""
+    return inverse_model(params, batch.before, batch.after, batch.change, batch.cells)
+
+
+def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
+    """The terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS, or the wanted ones of these: what an
+    ablation leaves out takes no time. For a batch with targets, the one term of SE3-Nets.
     """
     if batch.targets is not None:
         prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
         return {"association": losses.association_loss(prediction.points, batch.targets, batch.valid)}
-    prediction, flow, heatmaps = run_model(params, sizes, batch, camera)
-    next_embedding = state_embedding(encode(params, batch.next_points), batch.next_valid)
-    free = free_radius(batch.points, getval(prediction.points), ray_spacing(batch.points, camera))
-    maps = losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared, free,
-                                ray_spacing(batch.next_points, camera))
-    return {
-        "chamfer": losses.chamfer_loss(*maps),
-        "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
-                                                               batch.shared, batch.next_shared),
-        "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
-        "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
-        "inverse": losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells,
-                                       prediction.embedding, next_embedding),
+    prediction, flow = run_forward_model(params, sizes, batch, camera)
+
+    @lru_cache
+    def maps():  # two terms share them
+        free = free_radius(batch.points, getval(prediction.points), ray_spacing(batch.points, camera))
+        return losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared, free,
+                                    ray_spacing(batch.next_points, camera))
+
+    def inverse():
+        heatmaps = run_inverse_model(params, batch)
+        next_embedding = state_embedding(encode(params, batch.next_points), batch.next_valid)
+        return losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells, prediction.embedding, next_embedding)
+
+    terms = {
+        "chamfer": lambda: losses.chamfer_loss(*maps()),
+        "distance_smoothness": lambda: losses.distance_smoothness_loss(*maps(), batch.images, batch.next_images,
+                                                                       batch.shared, batch.next_shared),
+        "photometric": lambda: losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
+        "flow_smoothness": lambda: losses.flow_smoothness_loss(flow, batch.images, batch.valid),
+        "inverse": inverse,
     }
+    return {name: term() for name, term in terms.items() if name in wanted}
 
 
 def unflatten(vector, layout):
@@ -159,11 +169,14 @@ def unflatten(vector, layout):
 
 
 def batch_gradient(vector, layout, sizes, batch, camera, weights):
-    """Mean terms as floats, and the gradient (P,) of the full loss, Eq. (6), at parameters `vector` (P,)."""
-    kept = {}
+    """Mean terms as floats, and the gradient (P,) of the full loss, Eq. (6), at parameters `vector` (P,).
+
+    Terms of weight 0 are not computed.
+    """
+    kept, weights = {}, {name: weight for name, weight in weights.items() if weight}
 
     def objective(vector):
-        terms = loss_terms(unflatten(vector, layout), sizes, batch, camera)
+        terms = loss_terms(unflatten(vector, layout), sizes, batch, camera, weights)
         kept.update((name, float(getval(value).mean())) for name, value in terms.items())
         return losses.full_loss(terms, weights)
 
@@ -220,6 +233,8 @@ class Recipe:
         terms = ASSOCIATION_WEIGHTS if self.association else WEIGHTS
         if set(self.weights) != set(terms) or not all(0 <= value < float("inf") for value in self.weights.values()):
             raise ValueError(f"weights: expected a finite number >= 0 for each of {sorted(terms)}, got {self.weights}")
+        if not any(self.weights.values()):
+            raise ValueError("weights: expected at least one above 0")
 
 
 def learning_rate(recipe, step):

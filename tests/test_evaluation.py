@@ -6,7 +6,7 @@ from test_training import SETTINGS, TINY, pokes_seen, random_run
 from hind4sight_min import evaluation
 from hind4sight_min.interactions import Truth, cell_centres, cells_of
 from hind4sight_min.networks import Prediction, windows
-from hind4sight_min.training import make_batch, run_model, start_run
+from hind4sight_min.training import make_batch, run_forward_model, start_run
 
 
 def shifted_block(data, shift):
@@ -99,7 +99,7 @@ def test_predict_pastes_the_windows_into_the_picture():
     rows = np.array([0, 3, 5])
     whole, prediction, flow, *_ = evaluation.predict(run, data, rows)
     batch = make_batch(data, rows)
-    expected, window_flow, _ = run_model(run.params, run.recipe.sizes, batch, data.camera)
+    expected, window_flow = run_forward_model(run.params, run.recipe.sizes, batch, data.camera)
     for i, (rows_in, columns_in) in enumerate(windows(data.pokes[rows], data.camera)):
         inside = np.zeros((12, 16), bool)
         inside[rows_in, columns_in] = True

@@ -70,7 +70,7 @@ def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
     assert all(value > 0 for value in terms.values())
 
 
-def test_every_term_reaches_the_forward_model_and_every_ablation_is_a_zero():
+def test_every_term_reaches_the_forward_model_and_a_weight_of_none_is_refused():
     data, run = pokes_seen(), random_run()
     batch = make_batch(data, np.arange(3))
     zero = dict.fromkeys(training.WEIGHTS, 0.0)
@@ -80,8 +80,25 @@ def test_every_term_reaches_the_forward_model_and_every_ablation_is_a_zero():
         assert np.abs(parts["encoder_1_w"]).max() > 0, name
         assert (np.abs(parts["mask_w"]).max() > 0) == (name != "inverse")
         assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
-    _, gradient = batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, zero)
-    assert not gradient.any()
+    with pytest.raises(ValueError, match="weights"):  # nothing to learn from
+        batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, zero)
+    with pytest.raises(ValueError, match="weights"):
+        batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, {**zero, "chamfre": 1.0})
+
+
+def test_an_ablated_term_is_not_computed_and_changes_nothing():
+    data, run = pokes_seen(), random_run()
+    batch = make_batch(data, np.arange(3))
+    args = run.vector, run.layout, SIZES, batch, data.camera
+    whole, gradient = batch_gradient(*args, training.WEIGHTS)
+    parts = 0
+    for names in (("chamfer",), ("distance_smoothness", "inverse"), ("photometric", "flow_smoothness")):
+        terms, part = batch_gradient(*args, {name: weight * (name in names) for name, weight in
+                                             training.WEIGHTS.items()})
+        assert terms == {name: whole[name] for name in names}
+        assert np.linalg.norm(part) > 1e-3 * np.linalg.norm(gradient)
+        parts = parts + part
+    np.testing.assert_allclose(parts, gradient, atol=1e-5 * np.abs(gradient).max())
 
 
 def test_training_lowers_the_loss_it_trains():

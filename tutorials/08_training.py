@@ -185,7 +185,7 @@ step, ratio, on, off, iou = np.array(measured).T  # each (epochs + 1,)
 fresh = training.start_run(recipe, train)
 noisy = training.make_batch(train, np.arange(100), rng=np.random.default_rng(1), image_noise=recipe.image_noise)
 level = training.loss_terms(fresh.params, recipe.sizes, noisy, camera)
-level = {name: float(np.mean(values)) for name, values in level.items()}
+level = {name: float(np.mean(values)) for name, values in level.items() if name in run.log[0]}
 epoch_end = [entry["step"] for entry in run.log]
 shipped = evaluation.evaluate(training.load_run(lesson.data_small() / "checkpoint.npz"), held_out[MEASURED],
                               truth[MEASURED])
