@@ -192,21 +192,24 @@ def smooth_depth(depth, empty_depth, images):
     difference = seen * (depth - empty_depth).astype(np.float32).reshape(seen.shape)
     guess = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in difference]) / np.float32(metres)
     red_green_blue = np.moveaxis(images.reshape(-1, height, width, 3), -1, 0) / np.float32(255 * colour)
+    # With a rim, where nothing is seen, a shift is an offset in flat arrays: twice as fast.
+    rim = (0, 0), (0, radius), (0, radius)
+    seen, difference, *guides = (np.pad(each, rim).ravel() for each in (seen, difference, guess, *red_green_blue))
     total, weight = difference.copy(), seen.copy()
     for dv in range(radius + 1):
         for du in range(-radius if dv else 1, radius + 1):  # each pair of pixels once, for both
-            here = np.s_[:, :height - dv, max(0, -du):width - max(0, du)]
-            there = np.s_[:, dv:, max(0, du):width - max(0, -du)]
+            offset = dv * (width + radius) + du
+            here, there = slice(None, -offset), slice(offset, None)
             apart = np.float32((dv ** 2 + du ** 2) / px ** 2)  # squared, in standard deviations
-            for guide in (guess, *red_green_blue):
+            for guide in guides:
                 apart = apart + np.square(guide[here] - guide[there])
             near = np.exp(-apart / 2)
             total[here] += near * difference[there]
             total[there] += near * difference[here]
             weight[here] += near * seen[there]
             weight[there] += near * seen[here]
-    smooth = (total / np.maximum(weight, 1e-6)).reshape(depth.shape)
-    return np.where(depth > 0, empty_depth + smooth, 0).astype(depth.dtype)
+    smooth = (total / np.maximum(weight, 1e-6)).reshape(-1, height + radius, width + radius)[:, :height, :width]
+    return np.where(depth > 0, empty_depth + smooth.reshape(depth.shape), 0).astype(depth.dtype)
 
 
 def associate_with_noise(depth, rng, window, threshold=0.10):
