@@ -125,11 +125,11 @@ def true_scene_flow(points, labels, pose_before, pose_after):
     points (H, W, 3) m arena, labels (H, W), poses (7, 7) -> (H, W, 3) float32 m.
     """
     flow = np.zeros(points.shape, np.float32)
+    before, after = (rotation_from_quaternion(pose[:, 3:]) for pose in (pose_before, pose_after))
     for index in np.unique(labels[labels > 0]) - 1:
         here = labels == index + 1
-        before, after = (rotation_from_quaternion(p[index, 3:]) for p in (pose_before, pose_after))
-        local = (points[here] - pose_before[index, :3]) @ before
-        flow[here] = local @ after.T + pose_after[index, :3] - points[here]
+        local = (points[here] - pose_before[index, :3]) @ before[index]
+        flow[here] = local @ after[index].T + pose_after[index, :3] - points[here]
     return flow
 
 
