@@ -159,7 +159,7 @@ def paper_tables():
     """The paper's tables with ours beside them, once the full runs are recorded."""
     figures = recorded("reproduce")
     if not figures:
-        return "The full runs take a night and are not recorded yet; `--quick` shows the tables in miniature."
+        return "The full runs take hours and are not recorded yet; `--quick` shows the tables in miniature."
     return reproduce.tables_text(list(reproduce.TABLES), figures)
 
 
