@@ -84,6 +84,8 @@ def test_every_term_reaches_the_forward_model_and_a_weight_of_none_is_refused():
         batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, zero)
     with pytest.raises(ValueError, match="weights"):
         batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, {**zero, "chamfre": 1.0})
+    with pytest.raises(ValueError, match="weights.*above 0"):
+        replace(TINY, weights=zero)
 
 
 def test_an_ablated_term_is_not_computed_and_changes_nothing():
