@@ -71,6 +71,8 @@ HEADLINES = {
                              "<= 0.125"),
     "noisy_over_se3nets_da11": ("reproduce", "noisy_over_se3nets_da11", "paper: against SE3-Nets 11 x 11, both noises",
                                 "{:.2f}", "<= 0.74"),
+    "noisy_over_se3nets_da11_scaled": ("reproduce", "noisy_over_se3nets_da11_scaled",
+                                       "paper: the same, window scaled to our pictures", "{:.2f}", "<= 0.74"),
     "ablation_order_holds": ("reproduce", "ablation_order_holds", "paper: order of the ablation holds (1: yes)",
                              "{:.0f}", "1"),
     "optical_epe_over_best_peer_moving": ("reproduce", "optical_epe_over_best_peer_moving",

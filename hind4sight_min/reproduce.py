@@ -5,7 +5,7 @@ finished cell leaves its figures in a file and is never run again. This file rea
 """
 import json
 from concurrent.futures import as_completed
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from multiprocessing import active_children
 from pathlib import Path
@@ -180,8 +180,11 @@ METRICS = ("flow_mse_cm2", "flow_mse_ratio", "still_epe_cm", "mask_iou", "optica
 
 
 def summarise(results, scale):
-    """{Cell: metrics} -> mean and SD over the seeds of every metric, a flat dict; and what the paper claims of them."""
-    figures = {}
+    """{Cell: metrics} -> mean and SD over the seeds of every metric, a flat dict; what the paper claims of them; the
+    scale, its seeds, and how long all the training took, on one core each.
+    """
+    figures = {**asdict(scale),
+               "train_core_hours": sum(metrics["train_seconds"] for metrics in results.values()) / 3600}
     for cell in results:
         if cell.seed == scale.seeds[0]:
             group = [results[other] for other in results if replace(other, seed=cell.seed) == cell]

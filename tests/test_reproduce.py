@@ -105,6 +105,9 @@ def test_summary_against_hand_values():
     assert figures["unseen_over_seen"] == pytest.approx(2)
     assert figures["inverse_target_cells"] == pytest.approx(0.65 / 2.5)
     assert figures["ablation_order_holds"] == 1.0
+    assert figures["seeds"] == TINY_SCALE.seeds and figures["steps"] == TINY_SCALE.steps
+    short, long = 2 * sum([1.0, 2, 3, 4, 0.5, 5, 6, 1.5]) + 8 * 0.5, 0.6 + 1.1
+    assert figures["train_core_hours"] == pytest.approx((2 * (short + long) + 18 * 0.1) / 3600)
     close = reproduce.summarise(made_up(TINY_SCALE, full=(1.95,)), TINY_SCALE)  # better, but within one SD
     assert close["ablation_order_holds"] == 0.0
 
