@@ -373,8 +373,7 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
     FigureCanvasAgg(figure)
     writer = PillowWriter(fps=1)
     with whole_file(path) as temporary:
-        gif = Path(temporary).with_suffix(".gif")
-        with writer.saving(figure, str(gif), dpi=80):
+        with writer.saving(figure, str(temporary), dpi=80):
             for t, image in enumerate(images):
                 figure.clear()
                 axes = figure.add_subplot(1, columns, 1)
@@ -389,7 +388,6 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
                     show_image(figure.add_subplot(1, columns, 2), goal_image, "goal\n")
                 for _ in range(2 if last else 1):
                     writer.grab_frame()
-        gif.replace(temporary)
 
 
 def control_figure(curves, pokes):

@@ -239,7 +239,7 @@ def whole_file(path):
     """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # the ending stays: libraries go by it
     try:
         yield temporary
         os.replace(temporary, path)

@@ -5,10 +5,12 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from test_planning import CAMERA, SETTINGS, island
+
 from hind4sight_min import control, planning, reproduce, training
 from hind4sight_min.__main__ import data_small, main
 from hind4sight_min.geometry import project
-from hind4sight_min.planning import Search
+from hind4sight_min.planning import Goal, Search, View
 
 SMALL = Search(candidates=16, elites=4, iterations=2)
 
@@ -33,6 +35,15 @@ def test_a_task_is_the_same_every_time_and_its_goal_can_be_met():
     assert ((away[moved] > 0.07) & (away[moved] < 0.15)).all() and (away[~moved] < 1e-3).all()
     assert np.abs(goal[:, :2]).max() < 0.15
     np.testing.assert_allclose(goal[moved, 2], start[moved, 2], atol=2e-3)  # upright, on the table
+
+
+def test_goals_are_turned_by_up_to_an_eighth():
+    angles = []
+    for seed in range(4):
+        with control.random_task(seed, 2) as task:
+            task.arena.kinds[:] = ["carton"] * len(task.arena.kinds)  # a kind whose turn can be seen
+            angles.extend(control.distances(task.arena.poses(), task)[1])
+    assert max(angles) <= np.pi / 4 + 0.02 and np.median(angles) > 0.1
 
 
 def test_marks_lie_on_the_movers_and_go_with_them():
@@ -134,6 +145,19 @@ def test_the_other_planners(policy, run):
         assert abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.radians(60)
 
 
+@pytest.mark.parametrize("farthest, shift", [(0, [-0.08, 0, 0]), (1, [0, 0.06, 0])])
+def test_greedy_pokes_what_is_farthest_from_its_goal(farthest, shift):
+    here = island().cloud
+    there = here + np.float32([0.1, 0.1, 0])
+    view = View(np.vstack([here[:-1], there[:-1], here[-1:], there[-1:]]), np.ones(42, bool), np.ones(42, bool), 2)
+    goals = view.cloud[-2:] + np.float32([0.01, 0, 0])
+    goals[farthest] = view.cloud[-2 + farthest] + np.float32(shift)
+    poke = control.greedy_poke(view, Goal(project(goals, CAMERA), None), CAMERA, SETTINGS, np.random.default_rng(0))[0]
+    assert np.linalg.norm(poke[:2] - view.cloud[-2 + farthest, :2]) < 0.03
+    turn = poke[2] - np.arctan2(shift[1], shift[0])
+    assert abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
+
+
 def test_no_poke_left_ends_the_loop_and_loses_nothing(run, monkeypatch):
     next_poke, calls = control.next_poke, []
 
@@ -232,20 +256,23 @@ def test_summary_of_the_control_experiment_by_hand():
     curves, results = {}, {}
     for planner in reproduce.PLANNERS:
         for movers in reproduce.OBJECTS:
-            end = {"learned": 0.02, "oracle": 0.01}.get(planner, 0.1)
-            curves[planner, movers] = np.linspace([0.1, 0.1], [end, end / 2], reproduce.POKES + 1).T
-            results[planner, movers, 0, 0] = {"angles_deg": [[10.0, 20.0], [4.0, 8.0]]}
+            end = {"learned": 0.04, "oracle": 0.02}.get(planner, 0.2)
+            curves[planner, movers] = np.linspace([0.1, 0.3], [end, end / 2], reproduce.POKES + 1).T
+            results[planner, movers, 0, 0] = {"angles_deg": [[10.0, 20.0, 60.0], [4.0, 8.0, 30.0]]}
+    curves["oracle", 3][:, 7] += 0.1
     for planner, shifts in (("learned", (0.0, 0.005, 0.05)), ("greedy", (0.02, 0.03, 0.0))):
         for seed, shift in enumerate(shifts):
             results[planner, 0, seed, 0] = {"others_shifted_m": shift, "distance_m": [0.18, 0.09],
                                               "angles_deg": [[], []]}
     figures = reproduce.summarise_planning(results, curves)
-    assert figures["plan_1_object"] == figures["plan_2_objects"] == pytest.approx(0.15)
+    assert figures["plan_1_object"] == figures["plan_2_objects"] == pytest.approx(0.06 / 0.4)
+    assert figures["learned_2_left_sd"] == pytest.approx((0.4 - 0.02 / 0.3) / np.sqrt(2))
+    assert figures["learned_2_left_after_5"] == pytest.approx((0.07 + 0.16) / 0.4)
     assert figures["plan_over_oracle"] == pytest.approx(2)
-    assert figures["learned_3_falls"] == 1
-    assert (figures["learned_1_angle_start_deg"], figures["learned_1_angle_deg"]) == (15, 6)
+    assert (figures["learned_3_falls"], figures["oracle_2_falls"], figures["oracle_3_falls"]) == (1, 1, 0)
+    assert (figures["learned_1_angle_start_deg"], figures["learned_1_angle_deg"]) == (20, 8)
     assert figures["learned_obstacle_avoided"] == pytest.approx(2 / 3)
     assert figures["greedy_obstacle_avoided"] == pytest.approx(1 / 3)
     assert figures["learned_obstacle_left"] == 0.5
     assert figures["greedy_obstacle_shift_cm"] == pytest.approx(5 / 3)
-    assert "0.15 \u00b1 0.07" in reproduce.planning_table(figures)
+    assert "0.15 \u00b1 0.24" in reproduce.planning_table(figures)

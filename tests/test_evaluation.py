@@ -4,6 +4,7 @@ from scipy.spatial.transform import Rotation
 from test_training import SETTINGS, TINY, pokes_seen, random_run
 
 from hind4sight_min import evaluation
+from hind4sight_min.geometry import project, unproject
 from hind4sight_min.interactions import Truth, cell_centres, cells_of
 from hind4sight_min.networks import Prediction, windows
 from hind4sight_min.training import make_batch, run_forward_model, start_run
@@ -92,6 +93,55 @@ def test_missing_depth_is_not_scored(monkeypatch):
     found = evaluation.evaluate(start_run(TINY, data), data, truth)
     assert found["flow_mse_ratio"] == pytest.approx(0.25, rel=1e-4)
     assert found["all_epe_cm"] == pytest.approx(6 * 2.5 / 186, rel=1e-4)
+
+
+def test_the_ratio_is_pooled_over_all_moving_points(monkeypatch):
+    data = pokes_seen()
+    told, truth = (shifted_block(data, (0.03, 0.04, 0.0)) for _ in range(2))
+    truth.poses_after[3:, 0, :3] *= 2  # four pokes move by 10 cm, of which 5 are foreseen
+    oracle(monkeypatch, data, told, 1.0)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    assert found["flow_mse_ratio"] == pytest.approx(4 * 25 / (3 * 25 + 4 * 100), rel=1e-4)
+
+
+def test_optical_error_of_all_pixels_is_over_those_with_depth(monkeypatch):
+    data, drift = pokes_seen(), 0.002
+    truth = shifted_block(data, (0.03, 0.04, 0.0))
+    data.depth_before[:, 8:, 12:] = 0
+    oracle(monkeypatch, data, truth, 1.0, drift)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    total = count = 0
+    for row in range(7):
+        points = unproject(data.depth_before[row], data.camera)
+        error = np.linalg.norm(project(points + np.float32([drift, 0, 0]), data.camera) - project(points, data.camera),
+                               axis=2)
+        valid = data.depth_before[row] > 0
+        total, count = total + error[valid & (truth.labels[row] != 1)].sum(), count + valid.sum()
+    assert found["optical_epe_all_px"] == pytest.approx(total / count, rel=1e-3) and total > 0
+
+
+def test_errors_of_the_inverse_model_against_cell_centres(monkeypatch):
+    data = pokes_seen()
+    truth = shifted_block(data, (0.03, 0.04, 0.0))
+    oracle(monkeypatch, data, truth, 1.0)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    centres = cell_centres(SETTINGS)
+    target, start = centres[cells_of(data.pokes[:, :2], SETTINGS)], centres[cells_of(data.starts, SETTINGS)]
+    assert found["inverse_target_cm"] == pytest.approx(
+        100 * np.median(np.linalg.norm(target - data.pokes[:, :2], axis=1)), rel=1e-4)
+    way = target - start
+    turn = np.arctan2(way[:, 1], way[:, 0]) - data.pokes[:, 2]
+    assert found["inverse_direction_deg"] == pytest.approx(
+        np.degrees(np.median(np.abs((turn + np.pi) % (2 * np.pi) - np.pi))), rel=1e-4)
+    assert found["inverse_target_cm"] < found["inverse_target_chance_cm"]
+
+
+def test_depth_noise_is_what_the_model_sees_and_not_what_it_is_measured_by():
+    data, run = pokes_seen(), random_run()
+    truth = shifted_block(data, (0.03, 0.04, 0.0))
+    clean, noisy, again = (evaluation.evaluate(run, data, truth, depth_noise=noise) for noise in (0.0, 0.01, 0.01))
+    assert noisy == again and noisy["flow_mse_ratio"] != clean["flow_mse_ratio"]
+    assert noisy["no_motion_mse_cm2"] == clean["no_motion_mse_cm2"]
 
 
 def test_predict_pastes_the_windows_into_the_picture():

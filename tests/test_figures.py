@@ -347,6 +347,11 @@ def test_population_figure_has_a_panel_per_round_and_marks_the_best():
         best = int(costs.argmin())
         assert (round(starts[best, 0], 6), round(targets[best, 0], 6)) in drawn
         assert (round(starts[2, 0], 6), round(targets[2, 0], 6)) not in drawn  # what cannot be is not drawn
+        lines = [line for line in axes.lines if len(line.get_xdata()) == 2]
+        colour = {round(line.get_xdata()[0], 6): line.get_color() for line in lines}
+        possible = np.argsort(costs)[:-1]
+        brightness = [sum(colour[round(starts[i, 0], 6)][:3]) for i in possible]
+        assert (np.diff(brightness) <= 0).all() and brightness[0] > brightness[-1] + 1  # cheap is bright
         (arrow,) = axes.patches
         np.testing.assert_allclose(arrow._posA_posB, [starts[best], targets[best]])
     with pytest.raises(ValueError, match="rounds"):
@@ -373,6 +378,35 @@ def test_save_sequence_writes_a_frame_per_picture_or_nothing(tmp_path):
     with pytest.raises(ValueError, match="images"):
         figures.save_sequence(tmp_path / "new.gif", 2 + images, None, arrows, np.zeros((3, 1, 2)), [[1, 1]], [0, 0, 0])
     assert not (tmp_path / "new.gif").exists()
+
+
+def a_sequence(path):
+    arrows = np.array([[[2.0, 3], [6, 7]], [[np.nan, np.nan], [6, 7]]])
+    figures.save_sequence(path, np.random.default_rng(1).random((3, 12, 16, 3)), None, arrows, np.full((3, 1, 2), 5.0),
+                          [[8.0, 8.0]], [0.1, 0.05, 0.01])
+
+
+def test_save_sequence_draws_the_pokes_that_have_a_start(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "draw_arrow", lambda axes, start, target: drawn.append((*start, *target)))
+    a_sequence(tmp_path / "plan.gif")
+    assert drawn == [(2, 3, 6, 7)]
+
+
+def test_a_failed_save_sequence_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    from matplotlib.animation import PillowWriter
+    a_sequence(tmp_path / "plan.gif")
+    old, real, count = (tmp_path / "plan.gif").read_bytes(), PillowWriter.grab_frame, []
+
+    def full_disk(self, **options):
+        count.append(1)
+        if len(count) == 2:
+            raise OSError("disk full")
+        real(self, **options)
+    monkeypatch.setattr(PillowWriter, "grab_frame", full_disk)
+    with pytest.raises(OSError, match="disk full"):
+        a_sequence(tmp_path / "plan.gif")
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.gif"] and (tmp_path / "plan.gif").read_bytes() == old
 
 
 def test_control_figure_draws_boxes_and_means():

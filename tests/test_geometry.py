@@ -133,6 +133,11 @@ def test_look_at_sees_the_target_in_the_middle_upright(eye, target):
 
 # --- rigid ------------------------------------------------------------------------------------------------
 
+def test_look_at_refuses_to_look_straight_down():
+    with pytest.raises(ValueError, match="eye, target"):
+        look_at((0.1, 0.2, 1), (0.1, 0.2, 0))
+
+
 def test_rigid_applies_rotation_then_translation_to_every_point():
     rng = np.random.default_rng(1)
     points, transform = rng.normal(size=(2, 4, 3)), np.eye(4)
@@ -184,6 +189,11 @@ def test_unproject_puts_pixels_without_depth_at_the_camera():
 def test_unproject_refuses_a_picture_of_another_size(shape):
     with pytest.raises(ValueError, match="depth"):  # such as the intrinsics of the full-size picture
         unproject(np.ones(shape), make_camera())
+
+
+def test_unproject_refuses_depth_in_whole_numbers():
+    with pytest.raises(ValueError, match="floating-point metres"):
+        unproject(np.full((HEIGHT, WIDTH), 700, np.uint16), make_camera())
 
 
 def test_project_inverts_unproject():

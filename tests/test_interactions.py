@@ -3,6 +3,7 @@ import json
 import os
 import pickle
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from hind4sight_min.geometry import Camera, look_at, unproject
 from hind4sight_min.interactions import (DEPTH_UNIT, FORMAT, Interactions, Truth, add_depth_noise, associate_with_noise,
                                          cell_centres, cells_of, grid_shape, load_interactions, load_npz, load_shard,
                                          load_truth, occupied_pixels, points_and_validity, rotation_from_quaternion,
-                                         save_npz, save_shard, shards_in, smooth_depth, true_scene_flow, truth_path)
+                                         save_npz, save_shard, shards_in, smooth_depth, true_scene_flow, truth_path,
+                                         write_json)
 
 WIDTH, HEIGHT = 8, 6
 SETTINGS = {"arena": 0.5, "cell": 0.025}
@@ -380,6 +382,20 @@ def test_unknown_array_is_named(tmp_path):
 
 
 # --- folders ----------------------------------------------------------------------------------------------
+
+def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "figures.json"
+    write_json(path, {"a": 1})
+    old = path.read_bytes()
+
+    def full_disk(self, text):
+        self.write_bytes(b"{")
+        raise OSError("disk full")
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    with pytest.raises(OSError, match="disk full"):
+        write_json(path, {"a": 2})
+    assert path.read_bytes() == old and [each.name for each in tmp_path.iterdir()] == ["figures.json"]
+
 
 def test_shards_in_sorts_and_ignores_other_files(tmp_path):
     for index in (10, 2, 0):

@@ -9,9 +9,10 @@ from scipy.special import log_softmax, softmax
 
 from hind4sight_min import losses
 from hind4sight_min.geometry import Camera, free_radius, look_at, ray_spacing, unproject
-from hind4sight_min.losses import (PAPER_WEIGHTS, chamfer_loss, distance_maps, distance_smoothness_loss,
-                                   edge_aware_smoothness, edge_weights, embedding_loss, flow_smoothness_loss, full_loss,
-                                   heatmap_cross_entropy, inverse_loss, photometric_loss, seen_in_both, warp_backward)
+from hind4sight_min.losses import (PAPER_WEIGHTS, association_loss, chamfer_loss, distance_maps,
+                                   distance_smoothness_loss, edge_aware_smoothness, edge_weights, embedding_loss,
+                                   flow_smoothness_loss, full_loss, heatmap_cross_entropy, inverse_loss,
+                                   photometric_loss, seen_in_both, warp_backward)
 
 B, H, W = 2, 4, 6
 N = H * W
@@ -184,6 +185,19 @@ def test_points_without_depth_neither_attract_nor_cost(hole_in):
     assert not gradient[:, 3].any() and np.abs(gradient[:, :3]).min() > 0
 
 
+def test_association_loss_and_its_gradient_match_a_loop():
+    rng = np.random.default_rng(0)
+    predicted, targets, valid, _ = clouds(rng, 0.6)
+    g = np.array([1.0, -2.0])
+    value, gradient = np.zeros(B), np.zeros_like(predicted)
+    for b, n in np.argwhere(valid):
+        difference = predicted[b, n] - targets[b, n]
+        value[b] += difference @ difference
+        gradient[b, n] = 2 * g[b] * difference
+    np.testing.assert_allclose(association_loss(predicted, targets, valid), value)
+    np.testing.assert_allclose(pulled_back(association_loss, 0, g, predicted, targets, valid), gradient)
+
+
 def test_distance_maps_refuse_a_cloud_without_depth_and_points_that_are_not_finite():
     inputs = list(clouds(np.random.default_rng(3)))
     nothing = np.zeros((B, N), bool)
@@ -248,6 +262,13 @@ def test_warp_backward_counts_the_border_itself_as_in_view():
     expected = np.ones((1, H, W), bool)
     expected[0, 1, 2] = expected[0, 2, 3] = False
     np.testing.assert_array_equal(in_view, expected)
+
+
+def test_rounding_carries_no_pixel_of_the_border_out_of_view():
+    flow = np.zeros((1, 4, 6, 2))
+    flow[0, 0, 0], flow[0, 3, 5], flow[0, 1, 0, 0] = -1e-4, 1e-4, -0.01
+    _, in_view = warp_backward(np.ones((1, 4, 6, 1)), flow)
+    assert in_view[0, 0, 0] and in_view[0, 3, 5] and not in_view[0, 1, 0] and in_view.sum() == 23
 
 
 def test_photometric_loss_is_zero_for_the_true_flow_only():

@@ -107,6 +107,22 @@ def test_the_demo_in_small(tmp_path, monkeypatch, capsys):
     assert "4. Look" in first
 
 
+def test_the_demo_is_evaluated_on_pokes_it_was_not_trained_on(tmp_path, monkeypatch):
+    class Enough(Exception):
+        pass
+    seeds = []
+
+    def collect(folder, pokes, seed, **_):
+        seeds.append(seed)
+        if len(seeds) == 2:
+            raise Enough
+        return {"counts": {"kept": pokes}, "seconds": 1.0, "share_in_bullet": None}
+    monkeypatch.setattr("hind4sight_min.simulator.collect", collect)
+    with pytest.raises(Enough):
+        run("demo", "--out", tmp_path, "--seed", 7)
+    assert seeds[0] == 7 != seeds[1]
+
+
 def test_without_pybullet_one_line_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
     one_line(capsys, run("collect", tmp_path / "pokes", "--pokes", 1), "pybullet", "pip install")
@@ -162,6 +178,23 @@ def test_weights_and_starting_point(tmp_path, capsys):
             run("train", data_small() / "train", third, "--weight", wrong)
         one_line(capsys, stop.value.code, "weight")
     one_line(capsys, run("train", data_small() / "train", third, "--weight", "chamfer=-1"), "weights")
+
+
+def test_options_of_train_are_those_of_the_recipe(tmp_path):
+    assert run("train", data_small() / "train", tmp_path / "a.npz", *TRAIN, "--masks", 3, "--depth-noise", 0.004,
+               "--seed", 5) == 0
+    recipe = training.load_run(tmp_path / "a.npz").recipe
+    assert (recipe.steps, recipe.batch, recipe.depth_noise, recipe.seed) == (3, 2, 0.004, 5)
+    assert (recipe.sizes.width, recipe.sizes.masks) == (8, 3)
+
+
+def test_a_checkpoint_of_another_camera_is_refused(tmp_path, capsys):
+    model = training.load_run(data_small() / "checkpoint.npz")
+    model.meta["camera"]["fx"] += 1
+    training.save_run(tmp_path / "model.npz", model)
+    for arguments in (["evaluate", tmp_path / "model.npz"],
+                      ["show", tmp_path / "model.npz", "--out", tmp_path / "p.png"]):
+        one_line(capsys, run(*arguments), "another camera")
 
 
 def test_rows_outside_the_data(tmp_path, capsys):

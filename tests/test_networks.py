@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 from autograd import grad
+from scipy.spatial.transform import Rotation
 
 from hind4sight_min import networks
 from hind4sight_min.geometry import Camera, look_at, project
-from hind4sight_min.networks import (Sizes, encoder_features, forward_model, fourier, height_map, init_parameters,
-                                     inverse_model, most_changed, poke_axes, poke_features, poke_frame,
-                                     pooling_weights, state_embedding, windows)
+from hind4sight_min.networks import (Sizes, encode, encoder_features, forward_model, fourier, height_map,
+                                     init_parameters, inverse_model, most_changed, poke_axes, poke_features,
+                                     poke_frame, pooling_weights, state_embedding, windows)
+from hind4sight_min.ops import weighted_means
 
 SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6, inverse=9)
 
@@ -130,6 +132,33 @@ def test_state_embedding_is_the_mean_over_valid_points():
     embedding = state_embedding(features, valid)
     np.testing.assert_allclose(embedding[0], features[0, 15:].mean(axis=0))
     np.testing.assert_allclose(embedding[1], features[1].mean(axis=0))
+
+
+def test_the_next_embedding_is_the_present_one_and_a_change():
+    rng = np.random.default_rng(0)
+    points, valid, pokes = scene(rng)
+    valid[:, :9] = False
+    params = random_parameters(rng)
+    there = forward_model(params, SIZES, points, valid, pokes).embedding
+    params["next_2_w"], params["next_2_b"] = 0 * params["next_2_w"], 0 * params["next_2_b"]
+    still = forward_model(params, SIZES, points, valid, pokes).embedding
+    np.testing.assert_allclose(still, state_embedding(encode(params, points), valid))
+    assert np.abs(there - still).max() > 1e-3
+
+
+def test_a_motion_turns_about_its_masks_centroid_and_then_shifts():
+    rng = np.random.default_rng(0)
+    points, valid, pokes = scene(rng)
+    valid[:, :9] = False
+    params = random_parameters(rng)
+    params["motion_3_w"] = 0 * params["motion_3_w"]
+    params["motion_3_b"] = np.array([0.4, -0.2, 0.6, 1, -2, 9])  # in units of 5 mm and 0.1 rad
+    found = forward_model(params, SIZES, points, valid, pokes)
+    centroids = weighted_means(poke_frame(points, pokes), found.masks[..., 1:] * valid[..., None])
+    moved = np.einsum("bkij,bkj->bki", found.rotations[:, 1:], centroids) + found.translations[:, 1:]
+    np.testing.assert_allclose(moved - centroids, np.tile([0.002, -0.001, 0.003], (2, 2, 1)), atol=1e-8)
+    turns = Rotation.from_matrix(found.rotations[:, 1:].reshape(-1, 3, 3)).as_rotvec()
+    np.testing.assert_allclose(turns, np.tile([0.1, -0.2, 0.9], (4, 1)), atol=1e-6)
 
 
 def test_inverse_model_moves_with_the_change():

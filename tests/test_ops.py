@@ -394,6 +394,12 @@ def test_pool_and_its_gradient_match_a_loop(share):
     check_grads(pool, modes=["rev"], order=1)(x, valid, weights)
 
 
+def test_equal_maxima_all_have_the_gradient():
+    x, valid = np.array([[[2.0], [2.0], [1.0]]]), np.ones((1, 3), bool)
+    gradient = pulled_back(pool, 0, np.array([[3.0, 0.0]]), x, valid, np.ones((1, 1, 3)))
+    np.testing.assert_array_equal(gradient[0, :, 0], [3, 3, 0])
+
+
 def test_the_maximum_is_zero_with_zero_gradient_where_nothing_is_valid():
     x, weights = np.random.default_rng(14).random((2, 3, 4)) + 1, np.zeros((2, 1, 3))
     valid = np.array([[False, False, False], [False, True, False]])

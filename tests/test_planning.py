@@ -88,6 +88,17 @@ def test_cem_keeps_the_best_ever_seen():
     assert lowest == found[0].min() and bowl(best[None])[0] == lowest
 
 
+def test_every_round_starts_with_the_best_so_far():
+    rng, seen = np.random.default_rng(2), []
+    planning.cem(bowl, first_population(rng), rng, Search(iterations=5), lambda *state: seen.append(state))
+    best, lowest = None, np.inf
+    for _, population, costs, *_ in seen:
+        if best is not None:
+            np.testing.assert_array_equal(population[0], best)
+        if costs.min() < lowest:
+            best, lowest = population[costs.argmin()].copy(), costs.min()
+
+
 def test_cem_with_fewer_possible_candidates_than_elites_and_with_none():
     rng, population = np.random.default_rng(3), first_population(np.random.default_rng(4))
     only = population[7].copy()
@@ -256,18 +267,47 @@ def test_cost_against_brute_force():
         planning.planning_cost(clouds, view, Goal(goal.pixels, None), CAMERA, Search())
 
 
+def test_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects():
+    view = island()
+    table = np.float32([[0.2, 0.2, 0], [-0.2, 0.1, 0]])
+    two = View(np.vstack([table, view.cloud, [[0.01, 0, 0.03]]]).astype(np.float32), np.ones(24, bool),
+               np.r_[False, False, np.ones(22, bool)], 2)
+    goal = Goal(project(two.cloud[-2:], CAMERA) + [[10, 0], [0, 4]], None)
+    found = planning.planning_cost(two.cloud[None], two, goal, CAMERA, Search(chamfer_weight=0.0))
+    assert found[0] == pytest.approx((10 + 4) / 2 - planning.SLACK, rel=1e-4)
+    there = Goal(project(two.cloud[-2:], CAMERA), two.cloud[2:])
+    assert planning.planning_cost(two.cloud[None], two, there, CAMERA, Search())[0] == 0
+
+
+def shift_along(view, length):
+    """Rollouts of a model under which every poke shifts everything by `length` m along itself."""
+    def step(clouds, pokes):
+        along = np.column_stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2]), 0 * pokes[:, 2]])
+        return clouds + length * along[:, None]
+    return lambda sequences: planning.roll(step, view, sequences, SETTINGS)
+
+
+def test_a_plan_of_two_pokes_costs_the_mean_of_both():
+    view, there, search = island(), np.array([-0.06, 0, 0]), Search(horizon=2, candidates=128, iterations=3)
+    goal = Goal(project(view.cloud[-1:] + there, CAMERA), view.cloud + there)
+    found = planning.plan(shift_along(view, 0.02), view, goal, CAMERA, SETTINGS, search, np.random.default_rng(0))
+    clouds, starts = shift_along(view, 0.02)(found.pokes[None])
+    costs = [planning.planning_cost(clouds[:, h], view, goal, CAMERA, search)[0] for h in (0, 1)]
+    assert found.cost == pytest.approx(np.mean(costs)) and costs[1] < costs[0] and np.isfinite(starts).all()
+
+
+def test_arrows_begin_ten_centimetres_before_the_target():
+    starts, targets = planning.arrows_of(np.array([[0.05, 0.02, np.pi / 2]]), SETTINGS, CAMERA)
+    np.testing.assert_allclose(targets, project(np.array([[0.05, 0.02, 0]]), CAMERA))
+    np.testing.assert_allclose(starts, project(np.array([[0.05, -0.08, 0]]), CAMERA))
+
+
 def test_plan_pushes_towards_the_goal_under_a_model_known_in_closed_form():
     # Under this model every poke that starts 10 cm or more away shifts everything by 4 cm along itself.
     view = island()
     there = np.array([-0.04, 0.0, 0.0])
     goal = Goal(project(view.cloud[-1:] + there, CAMERA), view.cloud + there)
-
-    def step(clouds, pokes):
-        return clouds + 0.04 * np.column_stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2]), 0 * pokes[:, 2]])[:, None]
-
-    def rollout(sequences):
-        return planning.roll(step, view, sequences, SETTINGS)
-    rounds = []
+    rollout, rounds = shift_along(view, 0.04), []
     found = planning.plan(rollout, view, goal, CAMERA, SETTINGS, Search(iterations=6), np.random.default_rng(9),
                           lambda i, population, costs, mean, deviation: rounds.append(costs.min()))
     assert abs(abs(found.pokes[0, 2]) - np.pi) < 0.15

@@ -8,10 +8,11 @@ import pytest
 from test_evaluation import shifted_block
 from test_training import TINY, pokes_seen
 
-from hind4sight_min import evaluation, reproduce, training
+from hind4sight_min import evaluation, objects, reproduce, simulator, training
 from hind4sight_min.__main__ import main
 from hind4sight_min.reproduce import MODELS, Cell, Scale
 
+TIMES = {name: i + 1 for i, name in enumerate(reproduce.METRICS)}  # so that no metric is taken for another
 TINY_SCALE = Scale(train_pokes=7, test_pokes=7, steps=3, long_steps=4, seeds=(1, 2))
 
 
@@ -80,16 +81,39 @@ def test_a_run_of_another_recipe_is_not_gone_on_with(tmp_path, small_world):
         reproduce.run_cell(cell, tmp_path, replace(TINY_SCALE, steps=5))
 
 
+def test_a_cell_is_evaluated_under_the_noise_it_was_trained_with(tmp_path, small_world, monkeypatch):
+    told = []
+    monkeypatch.setattr(evaluation, "evaluate", lambda *_, depth_noise=0.0: told.append(depth_noise) or {})
+    for noise in ("clean", "noisy"):
+        reproduce.run_cell(Cell("full", noise, 1), tmp_path, TINY_SCALE)
+    assert told == [0.0, 0.01]
+
+
+def test_training_test_and_unseen_pokes_are_three_things(tmp_path, monkeypatch):
+    calls = {}
+    monkeypatch.setattr(simulator, "collect", lambda folder, pokes, seed, settings, *_: calls.update(
+        {folder.name: (pokes, seed, settings)}))
+    reproduce.collect_data(tmp_path, reproduce.FULL, 1)
+    assert {name: call[0] for name, call in calls.items()} == {"train": 24000, "test": 1000, "unseen": 1000}
+    assert len({seed for _, seed, _ in calls.values()}) == 3
+    for kind in ("kinds", "textures"):
+        drawn = {name: set(getattr(settings, kind)) for name, (_, _, settings) in calls.items()}
+        assert drawn["unseen"] == set(objects.HELD_OUT[kind])
+        assert drawn["train"] == drawn["test"] and not drawn["train"] & drawn["unseen"]
+
+
 def made_up(scale, full=(1.0, 1.1)):
-    """Metrics of every cell: the full model best, then 2D + 3D, then the others; two seeds apart by 0.1 or so."""
+    """Metrics of every cell: the full model best, then 2D + 3D, then the others; two seeds apart by 0.1 or so; every
+    metric as many times that as its place in METRICS, which is 1 for the squared error.
+    """
     base = {"full": full[0], "2d_3d": 2.0, "3d": 3.0, "2d": 4.0, "se3nets_0": 0.5, "se3nets_9": 5.0, "se3nets_11": 6.0,
             "se3nets_3": 1.5}
     results = {}
     for cell in reproduce.cells_of_tables(["flow", "ablation"], scale):
         value = base[cell.model] + 0.1 * (cell.seed - 1) + (0.5 if cell.noise == "noisy" else 0) - 0.4 * cell.long
-        metrics = {name: value for name in reproduce.METRICS if not name.startswith("unseen")}
+        metrics = {name: times * value for name, times in TIMES.items() if not name.startswith("unseen")}
         if cell.long and cell.noise == "clean":
-            metrics.update(unseen_flow_mse_ratio=2 * value, unseen_mask_iou=0.5)
+            metrics.update(unseen_flow_mse_ratio=4 * value, unseen_mask_iou=0.5)
         results[cell] = metrics
     return results
 
@@ -98,30 +122,46 @@ def test_summary_against_hand_values():
     figures = reproduce.summarise(made_up(TINY_SCALE), TINY_SCALE)
     assert figures["2d_noisy_flow_mse_cm2"] == pytest.approx(4.55)
     assert figures["2d_noisy_flow_mse_cm2_sd"] == pytest.approx(0.1 / np.sqrt(2))
-    assert figures["flow_mse_ratio_clean"] == pytest.approx(0.65)
-    assert figures["flow_mse_ratio_noisy"] == pytest.approx(1.15)
+    assert figures["flow_mse_ratio_clean"] == pytest.approx(2 * 0.65)
+    assert figures["flow_mse_ratio_noisy"] == pytest.approx(2 * 1.15)
+    for headline, metric in (("mask_iou", "mask_iou"), ("inverse_direction_deg", "inverse_direction_deg")):
+        assert figures[headline] == pytest.approx(TIMES[metric] * 0.65)
+    assert figures["train_minutes"] == pytest.approx(TIMES["train_seconds"] * 0.65 / 60)
     assert figures["noisy_over_se3nets_da11"] == pytest.approx(1.55 / 6.55)
     assert figures["noisy_over_se3nets_da11_scaled"] == pytest.approx(1.55 / 2.05)
     assert figures["unseen_over_seen"] == pytest.approx(2)
-    assert figures["inverse_target_cells"] == pytest.approx(0.65 / 2.5)
+    assert figures["inverse_target_cells"] == pytest.approx(TIMES["inverse_target_cm"] * 0.65 / 2.5)
     assert figures["ablation_order_holds"] == 1.0
     assert figures["seeds"] == TINY_SCALE.seeds and figures["steps"] == TINY_SCALE.steps
     short, long = 2 * sum([1.0, 2, 3, 4, 0.5, 5, 6, 1.5]) + 8 * 0.5, 0.6 + 1.1
-    assert figures["train_core_hours"] == pytest.approx((2 * (short + long) + 18 * 0.1) / 3600)
+    assert figures["train_core_hours"] == pytest.approx(
+        TIMES["train_seconds"] * (2 * (short + long) + 18 * 0.1) / 3600)
     close = reproduce.summarise(made_up(TINY_SCALE, full=(1.95,)), TINY_SCALE)  # better, but within one SD
     assert close["ablation_order_holds"] == 0.0
 
 
+@pytest.mark.parametrize("means, deviations, holds", [
+    ((1, 2, 3, 4), (0.1, 0.1, 0.1, 0.1), True), ((1, 2, 3, 4), (0.1, 1.5, 0.1, 0.1), False),
+    ((1, 2, 3, 4), (1.5, 0.1, 0.1, 0.1), False), ((1, 2, 1.5, 4), (0.1, 0.1, 0.1, 0.1), False),
+    ((1, 2, 3, 1.5), (0.1, 0.1, 0.1, 0.1), False), ((3, 2, 4, 5), (0.1, 0.1, 0.1, 0.1), False)])
+def test_the_order_of_the_ablation(means, deviations, holds):
+    figures = {}
+    for model, mean, deviation in zip(("full", "2d_3d", "3d", "2d"), means, deviations):
+        figures[f"{model}_clean_flow_mse_cm2"], figures[f"{model}_clean_flow_mse_cm2_sd"] = mean, deviation
+    assert reproduce.order_holds(figures, "clean") == holds
+
+
 def test_tables_show_ours_beside_the_papers():
     figures = reproduce.summarise(made_up(TINY_SCALE), TINY_SCALE)
-    figures.update({f"{peer}_{metric}": 3.0 for peer in evaluation.PEERS for metric in ("optical_epe_px",
-                                                                                       "optical_epe_all_px")})
+    figures.update(dis_optical_epe_px=3.0, dis_optical_epe_all_px=5.0, farneback_optical_epe_px=4.0,
+                   farneback_optical_epe_all_px=2.0)
     figures.update(reproduce.optical_headlines(figures))
-    assert figures["optical_epe_over_best_peer_moving"] == pytest.approx(0.65 / 3)
+    for over, metric, best in (("moving", "optical_epe_px", 3), ("all", "optical_epe_all_px", 2)):
+        assert figures[f"optical_epe_over_best_peer_{over}"] == pytest.approx(TIMES[metric] * 0.65 / best)
     text = reproduce.tables_text(list(reproduce.TABLES), figures)
     row = next(line for line in text.splitlines() if line.startswith("| 2D loss + 3D loss"))
-    assert row.split(" | ")[1:5] == [f"{1.52 / 12.6:.3f}", "2.050 \u00b1 0.071", f"{1.78 / 12.6:.3f}",
-                                     "2.550 \u00b1 0.071"]
+    assert row.split(" | ")[1:5] == [f"{1.52 / 12.6:.3f}", "4.100 \u00b1 0.141", f"{1.78 / 12.6:.3f}",
+                                     "5.100 \u00b1 0.141"]
     for block in text.split("\n\n"):
         assert len({line.count("|") for line in block.splitlines()}) == 1
     assert "dis (FlowNet 2.0" in text and "full model, trained long" in text

@@ -138,7 +138,7 @@ def test_settings_accept_their_limits():
 
 
 @pytest.mark.parametrize("changed", [
-    dict(arena=-0.5), dict(arena=float("nan")), dict(cell=0), dict(poke_length=(0.18, 0.14)), dict(poke_length=0.16),
+    dict(arena=-0.5), dict(arena=float("nan")), dict(arena=0.6), dict(cell=0), dict(cell=0.03), dict(poke_length=(0.18, 0.14)), dict(poke_length=0.16),
     dict(objects_min=1.5), dict(pokes_per_scene=0),
     dict(pokes_per_scene=2.5),
     dict(finger_speed=0.0), dict(place_within=3.0)], ids=str)
@@ -458,6 +458,21 @@ def test_every_kind_stands_still_where_it_was_put(kind, built):
         assert before[2] == pytest.approx(height / 2, abs=1.5e-3)
         assert np.abs(before[:2]).max() <= 0.5 * Settings().place_within / 2 + 1e-3
         assert np.abs(after - before).max() < 1e-3
+
+
+@needs_bullet
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_weighs_what_its_volume_says(kind, monkeypatch):
+    made, add = [], Arena._add_object
+    monkeypatch.setattr(Arena, "_add_object", lambda self, *spec: made.append(spec) or add(self, *spec))
+    with make_arena(**single(kind, width=16, height=12)) as arena:
+        arena.new_scene()
+        mass, friction = arena.bullet.getDynamicsInfo(arena.bodies[0], -1, physicsClientId=arena._client)[:2]
+    _, outlines, height, taper, _ = made[-1]
+    volume = sum(ConvexHull(objects.prism(each, height, taper)).volume for each in objects.centred(outlines)[0])
+    _, density, (low, high) = KINDS[kind]
+    assert mass == pytest.approx(density * volume, rel=1e-6) and low <= friction <= high
+    assert 0.03 < mass < 1.5  # kg
 
 
 @needs_bullet

@@ -4,9 +4,9 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from hind4sight_min import losses, training
+from hind4sight_min import losses, networks, training
 from hind4sight_min.geometry import Camera, look_at, project, unproject
-from hind4sight_min.interactions import Interactions, cells_of
+from hind4sight_min.interactions import Interactions, add_depth_noise, cells_of, smooth_depth
 from hind4sight_min.networks import Sizes, windows
 from hind4sight_min.training import Recipe, batch_gradient, make_batch, start_run, train, unflatten
 
@@ -70,6 +70,29 @@ def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
     assert all(value > 0 for value in terms.values())
 
 
+def test_every_term_gets_its_own_arguments():
+    data, run = pokes_seen(), random_run()
+    data.depth_before[0, 5, 6] = data.depth_after[1, 6, 7] = 0
+    batch, params = make_batch(data, np.arange(3)), run.params
+    assert (batch.shared != batch.valid).any() and (batch.start_cells != batch.end_cells).any()
+    terms = training.loss_terms(params, SIZES, batch, data.camera)
+    prediction, flow = training.run_forward_model(params, SIZES, batch, data.camera)
+    maps = losses.distance_maps(prediction.points, batch.next_points, batch.shared, batch.next_shared)
+    start, end = training.run_inverse_model(params, batch)
+    after = networks.state_embedding(networks.encode(params, batch.next_points), batch.next_valid)
+    expected = {
+        "chamfer": losses.chamfer_loss(*maps),
+        "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images, batch.shared,
+                                                               batch.next_shared),
+        "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
+        "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
+        "inverse": losses.heatmap_cross_entropy(start, batch.start_cells)
+        + losses.heatmap_cross_entropy(end, batch.end_cells) + losses.embedding_loss(prediction.embedding, after)}
+    assert set(terms) == set(expected)
+    for name, value in terms.items():
+        np.testing.assert_allclose(value, expected[name], rtol=1e-5, err_msg=name)
+
+
 def test_every_term_reaches_the_forward_model_and_a_weight_of_none_is_refused():
     data, run = pokes_seen(), random_run()
     batch = make_batch(data, np.arange(3))
@@ -125,22 +148,41 @@ def test_the_gradient_of_a_batch_is_that_of_its_chunks(monkeypatch):
     chunks = train(data, start_run(recipe, data))
     difference = np.linalg.norm(chunks.first_moment - whole.first_moment)
     assert difference < 5e-3 * np.linalg.norm(whole.first_moment)  # rounding decides on which side of a kink it is
+    for name in training.WEIGHTS:
+        assert chunks.log[0][name] == pytest.approx(whole.log[0][name], rel=1e-4, abs=1e-5), name
+
+
+def test_the_log_is_the_mean_over_the_steps_of_an_epoch(monkeypatch):
+    data, recipe, seen = pokes_seen(count=20), replace(TINY, steps=6), []  # four steps an epoch
+    step = training.training_step
+
+    def watched(interactions, run, *rest):
+        before = dict(run.sums)
+        step(interactions, run, *rest)
+        seen.append({name: value - before.get(name, 0) for name, value in run.sums.items()})
+    monkeypatch.setattr(training, "training_step", watched)
+    log = train(data, start_run(recipe, data)).log
+    assert [epoch["step"] for epoch in log] == [4, 6]
+    for name in training.WEIGHTS:
+        for epoch, steps in zip(log, (seen[:4], seen[4:])):
+            assert epoch[name] == pytest.approx(np.mean([each[name] for each in steps]))
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path):
-    data, whole = pokes_seen(), train(pokes_seen(), start_run(TINY, pokes_seen()))
+    data = pokes_seen(count=18)  # an epoch ends in the middle of the fourth step
+    whole = train(data, start_run(TINY, data))
 
     class Stop(Exception):
         pass
 
-    def stop_at_four(run):
+    def stop_at_two(run):
         training.save_run(tmp_path / "run.npz", run)
-        if run.step == 4:
+        if run.step == 2:
             raise Stop
     with pytest.raises(Stop):
-        train(data, start_run(TINY, data), on_step=stop_at_four)
+        train(data, start_run(TINY, data), on_step=stop_at_two)
     resumed = training.load_run(tmp_path / "run.npz")
-    assert resumed.step == 4
+    assert resumed.step == 2 and not resumed.log and resumed.sums
     train(data, resumed)
     np.testing.assert_array_equal(resumed.vector, whole.vector)
     assert json.loads(json.dumps(resumed.log)) == json.loads(json.dumps(whole.log))
@@ -151,6 +193,18 @@ def test_training_with_depth_noise_differs_and_repeats():
     first, second = (train(data, start_run(noisy, data)).vector for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert not np.array_equal(first, train(data, start_run(TINY, data)).vector)
+
+
+def test_noisy_depth_is_smoothed_in_both_frames():
+    data, rows = pokes_seen(), np.arange(4)
+    batch = make_batch(data, rows, depth_noise=0.01, rng=np.random.default_rng(3), whole=True)
+    depth, rgb = (np.stack([getattr(data, f"{kind}_{when}")[rows] for when in ("before", "after")])
+                  for kind in ("depth", "rgb"))
+    noisy = add_depth_noise(depth, np.random.default_rng(3), 0.01)
+    expected = unproject(smooth_depth(noisy, data.empty_depth, rgb), data.camera).reshape(2, 4, -1, 3)
+    np.testing.assert_allclose(batch.points, expected[0], atol=1e-6)
+    np.testing.assert_allclose(batch.next_points, expected[1], atol=1e-6)
+    assert np.abs(expected - unproject(noisy, data.camera).reshape(expected.shape)).max() > 0.01
 
 
 def test_image_noise_is_on_the_images_of_frame_t_and_on_nothing_else():
@@ -214,6 +268,12 @@ def test_every_epoch_shows_every_row_once():
     np.testing.assert_array_equal(np.bincount(training.rows_of_step(replace(TINY, batch=20), 7, 0)[0]) >= 2, True)
 
 
+def test_half_of_the_interactions_are_shown_mirrored():
+    flags = np.array([training.rows_of_step(TINY, 7, step)[1] for step in range(200)])
+    assert 0.45 < flags.mean() < 0.55
+    assert not any(training.rows_of_step(replace(TINY, mirror=False), 7, step)[1].any() for step in range(20))
+
+
 def test_the_mirrored_batch_is_the_mirrored_world():
     data = pokes_seen()
     plain, mirrored = (make_batch(data, np.arange(3), mirror=mirror, whole=True) for mirror in (False, True))
@@ -262,6 +322,16 @@ def test_batch_against_the_data():
     assert 0 < (~batch.shared).sum() < 30 and 0 < (~batch.next_shared).sum() < 30
 
 
+def test_what_one_frame_does_not_show_has_not_changed(monkeypatch):
+    monkeypatch.setattr(networks, "CHANGED_POINTS", 20)
+    data = pokes_seen()
+    data.depth_after[0, 3, 4] = 0
+    batch = make_batch(data, np.arange(2))
+    seen = batch.after[0][batch.change[0] > 0]
+    assert len(seen) > 5
+    assert np.linalg.norm(seen - data.camera.arena_from_camera[:3, 3], axis=1).min() > 0.3  # none is the camera itself
+
+
 def test_a_window_is_cut_out_of_every_picture():
     data = pokes_seen()
     rows, mirror = np.array([1, 4, 2]), [False, True, False]
@@ -301,6 +371,13 @@ def test_checkpoint_round_trip(tmp_path):
     np.testing.assert_array_equal(training.load_run(tmp_path / "b.npz").vector, run.vector)
 
 
+def test_the_seconds_of_training_add_up_over_calls(tmp_path):
+    data, run = pokes_seen(), random_run()
+    run.meta["seconds"] = 1000.0
+    seconds = training.train_saving(data, run, tmp_path / "run.npz")
+    assert 1000 < seconds == training.load_run(tmp_path / "run.npz").meta["seconds"]
+
+
 @pytest.mark.parametrize("keep", [0, 10, 500, -20])
 def test_truncated_checkpoint(tmp_path, keep):
     path = tmp_path / "run.npz"
@@ -334,9 +411,21 @@ def test_bad_arguments():
             Recipe(**{name: 0})
 
 
-def test_a_gradient_that_is_not_finite_stops_the_run():
-    data = pokes_seen()
-    run = start_run(TINY, data)
+def test_a_gradient_that_is_not_finite_stops_the_run_and_leaves_it_as_it_was(monkeypatch):
+    data, run = pokes_seen(), random_run()
+    bad = np.zeros_like(run.vector)
+    bad[3] = np.nan
+    monkeypatch.setattr(training, "batch_gradient", lambda *_: (dict.fromkeys(training.WEIGHTS, 1.0), bad))
+    before = [run.vector.copy(), run.first_moment.copy(), run.second_moment.copy()]
+    with pytest.raises(FloatingPointError, match="step 0"):
+        train(data, run)
+    for old, new in zip(before, (run.vector, run.first_moment, run.second_moment)):
+        np.testing.assert_array_equal(old, new)
+    assert run.step == 0 and not run.sums and not run.log
+
+
+def test_parameters_that_are_not_finite_are_refused():
+    data, run = pokes_seen(), random_run()
     run.vector[:] = np.nan
-    with pytest.raises((FloatingPointError, ValueError)), np.errstate(invalid="ignore"):
+    with pytest.raises(ValueError, match="finite"), np.errstate(invalid="ignore"):
         train(data, run)
