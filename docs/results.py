@@ -69,6 +69,7 @@ HEADLINES = {
                              "<= 0.110"),
     "flow_mse_ratio_noisy": ("reproduce", "flow_mse_ratio_noisy", "paper: the same, 1 cm depth noise", "{:.3f}",
                              "<= 0.125"),
+    "flow_epe_ratio": ("reproduce", "flow_epe_ratio", "paper: error / no motion as lengths, not squares", "{:.2f}", ""),
     "noisy_over_se3nets_da11": ("reproduce", "noisy_over_se3nets_da11", "paper: against SE3-Nets 11 x 11, both noises",
                                 "{:.2f}", "<= 0.74"),
     "noisy_over_se3nets_da11_scaled": ("reproduce", "noisy_over_se3nets_da11_scaled",

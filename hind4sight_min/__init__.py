@@ -1,7 +1,9 @@
 """Hind4sight-Net in a few readable NumPy files: unsupervised dynamics models from pokes.
 
-Read in this order: geometry, ops, losses, networks, training, interactions, simulator, evaluation, planning, control.
+Read in this order: geometry, ops, losses, interactions, networks, training, objects, simulator, evaluation, planning,
+control.
 """
+import numbers
 import os
 import signal
 from concurrent.futures import ProcessPoolExecutor
@@ -11,6 +13,12 @@ from multiprocessing import get_context
 # starts threads of its own then competes with them. Set before NumPy loads, unless the user did.
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+
+def check_whole(name, value, least):
+    """Raise a ValueError that says what is wrong unless `value` is a whole number of at least `least`."""
+    if not isinstance(value, numbers.Integral) or value < least:
+        raise ValueError(f"{name}: expected a whole number >= {least}, got {value}")
 
 
 def worker_pool(jobs):

@@ -114,22 +114,30 @@ def print_collection(folder, result):
     print(f"{folder}: {counts['kept']} pokes in {result['seconds']:.1f} s; dropped: {dropped}; {spent}")
 
 
+RECIPE_OPTIONS = ("steps", "batch", "learning_rate", "weight", "start", "depth_noise", "masks", "width", "seed")
+
+
 def run_train(args):
+    if Path(args.out).suffix != ".npz":  # a folder of pokes without a checkpoint after it, or a name its log would take
+        raise ValueError(f"out: expected a name ending in .npz for the checkpoint, got {str(args.out)!r}")
     interactions = load_interactions(args.data)
+    given = {name: getattr(args, name) for name in RECIPE_OPTIONS if getattr(args, name) is not None}
     if args.resume:
         run = training.load_run(args.out)
+        if given:
+            raise ValueError(f"--resume: goes on with the recipe of {args.out}, which --{min(given)} cannot change")
     else:
         if Path(args.out).exists():
             raise ValueError(f"{args.out}: exists already; --resume goes on with it")
-        recipe = training.Recipe(steps=args.steps, batch=args.batch, learning_rate=args.learning_rate, seed=args.seed,
-                                 depth_noise=args.depth_noise, sizes=Sizes(masks=args.masks, width=args.width),
-                                 weights={**training.WEIGHTS, **dict(args.weight)})
+        start, weights = given.pop("start", None), {**training.WEIGHTS, **dict(given.pop("weight", ()))}
+        sizes = Sizes(**{name: given.pop(name) for name in ("masks", "width") if name in given})
+        recipe = training.Recipe(**given, sizes=sizes, weights=weights, mirror=interactions.camera.is_mirror_symmetric)
         run = training.start_run(recipe, interactions)
-        if args.start:
-            start = training.load_run(args.start)
-            if start.layout != run.layout:
-                raise ValueError(f"{args.start}: has networks of other sizes than this run")
-            run.vector = start.vector
+        if start:
+            first = training.load_run(start)
+            if first.layout != run.layout:
+                raise ValueError(f"{start}: has networks of other sizes than this run")
+            run.vector = first.vector
     seconds = train_and_save(run, interactions, args.out, args.jobs)
     print(f"{args.out}: {run.step} steps, {seconds:.0f} s in all")
     write_json(args.json, {"train_seconds": seconds, **{f"loss_{k}": v for k, v in run.log[-1].items()}})
@@ -160,21 +168,16 @@ def train_and_save(run, interactions, path, jobs):
 def run_evaluate(args):
     run = training.load_run(args.checkpoint)
     interactions = load_interactions(args.data)
-    check_camera(run, interactions, args.data)
+    training.check_camera(run, interactions.camera)
     metrics = evaluation.evaluate(run, interactions, load_truth(args.data), progress_line("evaluate"))
     print_metrics(metrics)
     write_json(args.json, metrics)
 
 
-def check_camera(run, interactions, data):
-    if run.meta["camera"] != interactions.meta["camera"]:
-        raise ValueError(f"{data}: taken with another camera than the checkpoint was trained with")
-
-
 def run_show(args):
     run = training.load_run(args.checkpoint)
     interactions, truth = load_interactions(args.data), load_truth(args.data)
-    check_camera(run, interactions, args.data)
+    training.check_camera(run, interactions.camera)
     if not 0 <= args.row < len(interactions):
         raise ValueError(f"row: expected 0 to {len(interactions) - 1}, got {args.row}")
     show_row(run, interactions, args.row, truth, args.out)
@@ -214,7 +217,7 @@ def run_plan(args):
     search = planning.Search(candidates=args.candidates, horizon=args.horizon, iterations=args.iterations,
                              pixel_weight=args.pixel_weight, **weights)
     with control.random_task(args.seed, args.objects, args.obstacle) as task:
-        planning.check_camera(run, task.arena.camera)
+        training.check_camera(run, task.arena.camera)
         if own:
             marks, goals = click(task.arena.observe()[0]) if args.click else (args.mark, args.goal)
             task = control.marked_task(task, marks, goals)
@@ -289,13 +292,14 @@ def run_demo(args):
     metrics = evaluation.evaluate(run, test, truth, progress_line("evaluate"))
     print_metrics(metrics)
     print("4. Look at one of them.")
-    motion = [np.abs(truth.poses_after[i] - truth.poses_before[i]).max() for i in range(len(test))]
+    motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
     row = int(np.argsort(motion)[int(0.7 * len(motion))])  # a poke that moved something well, not the best one
     show_row(run, test, row, truth, out / "interaction.png")
     print(f"{out / 'interaction.png'}\n5. Plan pokes to a goal with the model (CEM), carry them out, look again.")
-    with control.random_task(args.seed, 1) as task:
+    seed = args.seed + 2  # a scene of neither pokes
+    with control.random_task(seed, 1) as task:
         record = plan_and_show(run, task, "learned", planning.Search(), 6, out,
-                               {"seed": args.seed, "movers": 1, "obstacle": False})
+                               {"seed": seed, "movers": 1, "obstacle": False})
     metrics["plan_distance_left"] = float(record["distance"][-1].mean() / record["distance"][0].mean())
     seconds = time.perf_counter() - start
     print(f"The whole demo took {seconds:.0f} s.")
@@ -344,18 +348,18 @@ def build_parser():
     sub = command("train", run_train, "train the full model (Eq. 6) on a folder of shards, without labels")
     sub.add_argument("data", nargs="?", default=small / "train")
     sub.add_argument("out", help="checkpoint to write (.npz); its log goes beside it (.csv and .png)")
-    sub.add_argument("--steps", type=int, default=recipe.steps)
-    sub.add_argument("--batch", type=int, default=recipe.batch)
-    sub.add_argument("--learning-rate", type=float, default=recipe.learning_rate)
-    sub.add_argument("--weight", type=term_weight, action="append", default=[], metavar="TERM=VALUE",
+    sub.add_argument("--steps", type=int, help=f"of Adam ({recipe.steps})")
+    sub.add_argument("--batch", type=int, help=f"interactions per step ({recipe.batch})")
+    sub.add_argument("--learning-rate", type=float, help=f"at its peak ({recipe.learning_rate})")
+    sub.add_argument("--weight", type=term_weight, action="append", metavar="TERM=VALUE",
                      help=f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(recipe.weights)}")
     sub.add_argument("--start", metavar="CHECKPOINT", help="begin with its parameters instead of random ones")
-    sub.add_argument("--depth-noise", type=float, default=0.0, help="SD in m of the depth noise to train under")
-    sub.add_argument("--masks", type=int, default=Sizes.masks, help="K, background included")
-    sub.add_argument("--width", type=int, default=Sizes.width, help="units per layer of the forward model")
-    sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--depth-noise", type=float, help=f"SD in m of the noise to train under ({recipe.depth_noise:g})")
+    sub.add_argument("--masks", type=int, help=f"K, background included ({Sizes.masks})")
+    sub.add_argument("--width", type=int, help=f"units per layer of the forward model ({Sizes.width})")
+    sub.add_argument("--seed", type=int, help=f"({recipe.seed})")
     sub.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (the result does not depend on it)")
-    sub.add_argument("--resume", action="store_true", help="go on with the checkpoint OUT")
+    sub.add_argument("--resume", action="store_true", help="go on with the checkpoint OUT and its recipe")
     sub.add_argument("--json", help="write the figures here too")
 
     for name, function, text in (("evaluate", run_evaluate, "metrics of a checkpoint on a folder of shards"),

@@ -10,10 +10,11 @@ from functools import partial
 
 import numpy as np
 
-from . import planning
+from . import check_whole, planning
 from .geometry import project, unproject
 from .interactions import load_npz, rotation_from_quaternion, save_npz, true_scene_flow
 from .simulator import Arena, Settings
+from .training import check_camera
 
 FORMAT = "hind4sight_min plan 1"
 SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
@@ -51,6 +52,9 @@ def random_task(seed, movers, obstacle=False, settings=SETTINGS):
     obstacle: one object to be moved by 18 cm, and another one half-way, across half of it, that is marked to stay.
     Draws scenes until the goal is one that the objects can be in: apart from each other, in sight, inside the walls.
     """
+    if obstacle and movers != 1:
+        raise ValueError(f"movers: expected 1 with an obstacle, got {movers}")
+    check_whole("seed", seed, 0)
     rng = np.random.default_rng([seed, movers, obstacle])
     with Arena(settings, rng) as arena:
         for _ in range(200):
@@ -229,7 +233,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
     arena, rng = task.arena, np.random.default_rng(seed)
     camera, empty, settings = arena.camera, arena.empty_depth, asdict(arena.settings)
-    planning.check_camera(run, camera)
+    check_camera(run, camera)
     (rgb, depth, labels), view, goal = first_look(task)
     marks = view.cloud[-view.marked:]
     frames, poses, places = [(rgb, depth)], [arena.poses()], [marks]
@@ -256,14 +260,19 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
         pokes.append(poke)
         starts.append(np.full(2, np.nan) if start is None else start)
         next_rgb, depth, labels = arena.observe()
-        next_view = planning.view_of(depth, empty, camera, settings, marks)
-        if start is not None:
+        try:
+            next_view = planning.view_of(depth, empty, camera, settings, marks)
+        except planning.NoPoke:  # the last object left the arena: what was done so far is kept
+            next_view = None
+        if next_view and start is not None:
             marks = planning.follow(view, rgb, poke, moved[0], masks[0], next_view, next_rgb)
             next_view = planning.view_of(depth, empty, camera, settings, marks)
-        rgb, view = next_rgb, next_view
-        frames.append((rgb, depth))
+        frames.append((next_rgb, depth))
         poses.append(arena.poses())
         places.append(marks)
+        if next_view is None:
+            break
+        rgb, view = next_rgb, next_view
     measured = [distances(pose, task) for pose in poses]
     return {"rgb": np.stack([frame[0] for frame in frames]), "depth": np.stack([frame[1] for frame in frames]),
             "poses": np.stack(poses), "marks": np.stack(places), "pokes": np.array(pokes, np.float32).reshape(-1, 3),

@@ -359,7 +359,7 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
 
     images (T+1, H, W, 3) in [0, 1]; goal_image (H, W, 3) or None; arrows (T, 2, 2) px: start and target of each poke
     (NaN: it could not be carried out); marks (T+1, M, 2) px; goals (M, 2) px; distances (T+1,) m: to the goals, mean.
-    Raises ValueError for a path that does not end in .gif.
+    Raises ValueError for other shapes and for a path that does not end in .gif.
     """
     from matplotlib.animation import PillowWriter
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -367,6 +367,11 @@ def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
     if path.suffix.lower() != ".gif":
         raise ValueError(f"path: expected a name ending in .gif, got {path.name!r}")
     images = _checked("images", images, None, None, None, 3, low=0, high=1)
+    goals = _checked("goals", goals, None, 2)
+    marks = _checked("marks", marks, len(images), len(goals), 2)
+    distances = _checked("distances", distances, len(images), low=0)
+    if np.shape(arrows) != (len(images) - 1, 2, 2):
+        raise ValueError(f"arrows: expected shape ({len(images) - 1}, 2, 2), got {np.shape(arrows)}")
     columns = 1 if goal_image is None else 2
     figure = Figure(figsize=(4.2 * columns, 3.7), dpi=80)
     figure.subplots_adjust(left=0.02, right=0.98, top=0.88, bottom=0.02, wspace=0.04)

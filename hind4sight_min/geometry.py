@@ -2,7 +2,7 @@
 
 Frames: *arena* (z up, origin in the middle of the table surface) and *camera* (OpenCV: x right,
 y down, z forward). Units: metres, radians, pixels (a pixel's centre has integer coordinates).
-Everything here is differentiable by autograd; float32 in gives float32 out.
+What the losses go through is differentiable by autograd; float32 in gives float32 out.
 """
 from dataclasses import dataclass
 
@@ -75,7 +75,12 @@ def look_at(eye, target):
 
 
 def rigid(points, transform):
-    """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points."""
+    """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points.
+
+    Raises ValueError for whole-number points, whose dtype would cut the transform down to whole numbers too.
+    """
+    if not onp.issubdtype(points.dtype, onp.floating):
+        raise ValueError(f"points: expected floating-point metres, got {points.dtype}")
     matrix = transform.astype(points.dtype)
     return np.matmul(points, matrix[:3, :3].T) + matrix[:3, 3]  # ten times as fast as np.dot on a stack of clouds
 

@@ -51,6 +51,10 @@ class Interactions:
             value = getattr(self, name)
             if value.shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
+            kind = np.uint8 if name.startswith("rgb") else np.floating
+            if not np.issubdtype(value.dtype, kind):
+                raise ValueError(f"{name}: expected {'uint8' if kind is np.uint8 else 'floating-point numbers'}, "
+                                 f"got {value.dtype}")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
 
@@ -59,6 +63,8 @@ class Interactions:
 
     def __getitem__(self, rows):
         """The interactions at `rows` (a slice or an index array), same camera and meta."""
+        if np.ndim(rows) == 0 and not isinstance(rows, slice):
+            raise TypeError(f"rows: expected a slice or an index array, got {rows!r}")
         picked = {name: getattr(self, name)[rows] for name in
                   ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")}
         return Interactions(**picked, empty_depth=self.empty_depth, camera=self.camera, meta=self.meta)
@@ -333,11 +339,14 @@ def shards_in(folder):
 
 
 def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions. They must share camera and grid."""
+    """All shards of a folder, joined -> Interactions. They must share camera, arena and grid."""
     parts = [load_shard(path) for path in shards_in(folder)]
+    first = parts[0]
     for path, part in zip(shards_in(folder), parts):
-        if part.meta["camera"] != parts[0].meta["camera"] or part.grid_shape != parts[0].grid_shape:
-            raise ValueError(f"{path}: another camera or grid than the folder's first shard")
+        same = all(part.meta["settings"][name] == first.meta["settings"][name] for name in ("arena", "cell"))
+        if (part.meta["camera"] != first.meta["camera"] or not same
+                or not np.array_equal(part.empty_depth, first.empty_depth)):
+            raise ValueError(f"{path}: another camera, arena or grid than the folder's first shard")
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in
               ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")}
     return Interactions(**joined, empty_depth=parts[0].empty_depth, camera=parts[0].camera, meta=parts[0].meta)

@@ -3,6 +3,15 @@
 Every network is the same small perceptron applied to each point, plus *context*: pooled features of the whole cloud and
 a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
 once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
+
+The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. Box of Fig. 3 -> function here (its layers):
+    encoder, siamese             `encode` (encoder_*), one point at a time; `state_embedding`, its mean
+    poke                         `poke_frame`: not an input of its own but the frame that points are given in
+    decoder of masks             `forward_model` (trunk_*, context_*, shape_*, mask)
+    decoder of SE(3) motions     `_motions` (motion_*), from the features under each mask; the background's is fixed
+    next state embedding         `forward_model` (next_*)
+    inverse model, heat-maps     `inverse_model` (change_*, cell_*, heatmaps), from what `most_changed` finds
+Ours alone: `windows`, `height_map`, `pooling_weights`, `most_changed`, and all constants.
 """
 from dataclasses import dataclass
 
@@ -10,6 +19,7 @@ import autograd.numpy as np
 import numpy as onp
 from autograd.tracer import getval
 
+from . import check_whole
 from .geometry import project, so3_exp, transform_layer
 from .ops import dense, pool, softmax, take, weighted_means
 
@@ -28,10 +38,8 @@ class Sizes:
     inverse: int = 64
 
     def __post_init__(self):
-        for name, least in (("masks", 2), ("width", 1), ("head", 1), ("rounds", 1), ("embedding", 1),
-                            ("inverse", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name in ("masks", "width", "head", "rounds", "embedding", "inverse"):
+            check_whole(name, getattr(self, name), 2 if name == "masks" else 1)
 
 
 @dataclass
@@ -196,7 +204,7 @@ def state_embedding(features, valid):
     return np.reshape(np.matmul(mean[:, None], features), (len(mean), -1))
 
 
-MASK_BOUND = 6.0  # so a mask lies between exp(-6) / (1 + exp(-6)) and the like of 1 - exp(-6)
+MASK_BOUND = 6.0  # a mover's logit stays within so much of the background's, which is 0
 
 # A poke changes some 3 % of the points, so s_{t+1} - s_t is small beside s_t.
 CHANGE_GAIN = 30.0
@@ -270,7 +278,7 @@ def most_changed(points, next_points, valid):
     """Where the two clouds differ, pixel by pixel: the evidence of a poke.
 
     points, next_points (B, N, 3) m; valid (B, N) bool, depth in both -> the M most changed points before and after,
-    (B, M, 3) each, and their weights (B, M), summing to 1. The weight is |P_{t+1} - P_t|^4: the power keeps the many
+    (B, M, 3) each, and their weights (B, M), summing to 1 (0 where nothing changed). The weight is |P_{t+1} - P_t|^4: the power keeps the many
     small differences of a noisy depth picture from outvoting the few large ones.
     """
     change = onp.sum((next_points - points) ** 2, axis=2) ** 2 * valid

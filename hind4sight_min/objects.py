@@ -9,10 +9,12 @@ import numpy as np
 # --- objects: prisms over one or two convex outlines ---------------------------------------------------
 
 def rectangle(x0, y0, x1, y1):
+    """Corners (4, 2), counter-clockwise; everything here is in m."""
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
 
 def regular(sides, radius):
+    """Corners (sides, 2) of a regular polygon about the origin, counter-clockwise."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -46,7 +48,7 @@ def _cross(rng):
             rng.uniform(0.030, 0.045), 1.0)
 
 
-# kind -> (outlines of a random one, density in kg/m^3, range of friction)
+# kind -> (function that draws one: outlines in m, height in m, taper; density in kg/m^3; range of friction)
 KINDS = {
     "carton": (_carton, 700.0, (0.45, 0.60)),
     "can": (_can, 1400.0, (0.55, 0.70)),
@@ -60,6 +62,7 @@ HELD_OUT = {"kinds": ("wedge", "cross"), "textures": ("rings", "zigzag")}  # nev
 
 
 def area_and_centroid(outline):
+    """Of a polygon with corners (n, 2), counter-clockwise -> area in m^2, centroid (2,) m."""
     x, y = outline.T
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y
     area = cross.sum() / 2

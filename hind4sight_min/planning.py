@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .geometry import Camera, project
+from . import check_whole
+from .geometry import project
 from .interactions import cell_centres, cells_of, grid_shape, standing
 from .networks import forward_model, window_shape, windows
 
@@ -55,8 +56,7 @@ class Search:
 
     def __post_init__(self):
         for name in ("candidates", "elites", "iterations", "horizon"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)}")
+            check_whole(name, getattr(self, name), 1)
         if self.elites > self.candidates:
             raise ValueError(f"elites: expected at most {self.candidates}, the candidates, got {self.elites}")
         weights = self.pixel_weight, self.chamfer_weight
@@ -66,14 +66,6 @@ class Search:
 
 class NoPoke(ValueError):
     """There is nothing to poke, or no room to."""
-
-
-def check_camera(run, camera):
-    """Raise ValueError when a checkpoint was trained with another camera than this one."""
-    trained = Camera(**{**run.meta["camera"], "arena_from_camera": np.array(run.meta["camera"]["arena_from_camera"])})
-    same = all(np.allclose(getattr(trained, name), getattr(camera, name), rtol=1e-6) for name in vars(camera))
-    if not same:
-        raise ValueError("checkpoint: trained with another camera than this scene's")
 
 
 # --- what the robot sees -------------------------------------------------------------------------------------
@@ -212,7 +204,9 @@ def draw_pokes(rng, count, view, settings, horizon=1):
 # --- rollouts -----------------------------------------------------------------------------------------------------
 
 def roll(step, view, sequences, settings):
-    """A rollout of `step`: clouds (J, N + M, 3), pokes (J, 3) -> clouds after one poke."""
+    """What sequences of pokes (J, H, 3) lead to -> clouds (J, H, N + M, 3) m after each, starts (J, H, 2) m, NaN where
+    the finger finds no room. step: clouds (J, N + M, 3), pokes (J, 3) -> clouds after one poke.
+    """
     clouds = np.repeat(view.cloud[None], len(sequences), axis=0)
     after, starts = [], []
     for pokes in np.moveaxis(sequences, 1, 0):
@@ -348,7 +342,7 @@ def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None):
 # --- where the marks went ---------------------------------------------------------------------------------------------
 
 COLOUR = 0.10  # m: how far apart black and white count when points are matched by place and colour
-REACH = 0.055  # m: no point of an object is farther from a mark in its middle
+REACH = 0.055  # m: most of what is seen of an object is nearer to a mark in its middle
 
 
 def follow(view, rgb, poke, moved, masks, next_view, next_rgb):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import control, evaluation, planning, simulator, training, worker_pool
+from . import check_whole, control, evaluation, planning, simulator, training, worker_pool
 from .interactions import load_interactions, load_truth, write_json
 from .objects import HELD_OUT
 
@@ -50,6 +50,8 @@ MODELS = {
 }
 NOISES = {"clean": 0.0, "noisy": 0.01}  # m, SD of the depth noise in training and test
 
+# The paper prints "MSE (cm)". We read its numbers as squared errors in cm^2, as the name says; read as lengths, it is
+# our flow_epe_ratio that they have to be held against.
 NO_MOTION_PAPER = 12.6  # Table II
 PAPER = {  # Table I, flow MSE
     "se3nets_0": (1.00, 1.07), "se3nets_9": (1.68, 1.94), "se3nets_11": (2.07, 2.20), "2d": (1.86, 1.93),
@@ -92,9 +94,14 @@ def recipe_of(cell, scale):
 
 # --- data ------------------------------------------------------------------------------------------------------
 
+# Also of the shipped checkpoint's pokes. A task of this seed would share its random numbers with a training shard, and
+# so its objects: no scene of the control experiment has it.
+TRAIN_SEED = 5
+
+
 def collect_data(out, scale, jobs, progress=None):
     """Training pokes, test pokes, and test pokes of objects and textures never trained on; completes what is there."""
-    for name, pokes, seed, settings in (("train", scale.train_pokes, 5, simulator.Settings()),
+    for name, pokes, seed, settings in (("train", scale.train_pokes, TRAIN_SEED, simulator.Settings()),
                                         ("test", scale.test_pokes, 101, simulator.Settings()),
                                         ("unseen", scale.test_pokes, 102, simulator.Settings(**HELD_OUT))):
         simulator.collect(out / name, pokes, seed, settings, jobs, progress)
@@ -110,9 +117,12 @@ def _data(folder):
 def run_cell(cell, out, scale, save_every=60.0):
     """Train and evaluate one cell, from where it was -> its metrics, with train_seconds. Runs in a worker process."""
     path, figures = out / "cells" / f"{cell.name}.npz", out / "cells" / f"{cell.name}.json"
-    if figures.exists():
-        return json.loads(figures.read_text())
     recipe = recipe_of(cell, scale)
+    if figures.exists():
+        metrics = json.loads(figures.read_text())
+        if metrics.pop("recipe", None) != plain(asdict(recipe)):
+            raise ValueError(f"{figures}: made with another recipe; remove it, or choose another --out")
+        return metrics
     interactions, truth = _data(out / "train")
     run = training.load_run(path) if path.exists() else training.start_run(recipe, interactions)
     if run.recipe != recipe:
@@ -123,8 +133,13 @@ def run_cell(cell, out, scale, save_every=60.0):
     if cell.long and cell.noise == "clean":
         unseen = evaluation.evaluate(run, *_data(out / "unseen"))
         metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
-    write_json(figures, metrics)
+    write_json(figures, {**metrics, "recipe": asdict(recipe)})
     return metrics
+
+
+def plain(value):
+    """`value` as JSON gives it back: lists for tuples."""
+    return json.loads(json.dumps(value))
 
 
 # --- all of them ------------------------------------------------------------------------------------------------
@@ -152,6 +167,7 @@ def run_all(function, tasks, jobs, report=None):
 
 def reproduce(tables, out, scale, jobs=1, progress=None):
     """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
+    check_whole("jobs", jobs, 1)
     out = Path(out)
     described = {"train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes, "steps": scale.steps,
                  "long_steps": scale.long_steps}
@@ -174,7 +190,7 @@ def reproduce(tables, out, scale, jobs=1, progress=None):
     return figures
 
 
-METRICS = ("flow_mse_cm2", "flow_mse_ratio", "still_epe_cm", "mask_iou", "optical_epe_px", "optical_epe_all_px",
+METRICS = ("flow_mse_cm2", "flow_mse_ratio", "flow_epe_cm", "no_motion_epe_cm", "still_epe_cm", "mask_iou", "optical_epe_px", "optical_epe_all_px",
            "inverse_target_cm", "inverse_direction_deg", "no_motion_mse_cm2", "no_motion_optical_epe_px",
            "no_motion_optical_epe_all_px", "unseen_flow_mse_ratio", "unseen_mask_iou", "train_seconds")
 
@@ -201,6 +217,7 @@ def headlines(figures):
     """The figures that the paper's claims are held against."""
     found = {"flow_mse_ratio_clean": figures["full_clean_long_flow_mse_ratio"],
              "flow_mse_ratio_noisy": figures["full_noisy_long_flow_mse_ratio"],
+             "flow_epe_ratio": figures["full_clean_long_flow_epe_cm"] / figures["full_clean_long_no_motion_epe_cm"],
              "mask_iou": figures["full_clean_long_mask_iou"],
              "inverse_target_cells": figures["full_clean_long_inverse_target_cm"] / (100 * simulator.Settings().cell),
              "inverse_direction_deg": figures["full_clean_long_inverse_direction_deg"],
@@ -327,18 +344,23 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
     """The paper's control experiment -> flat dict of figures, curves {(planner, objects): (scenes, pokes + 1) m}.
 
-    Scenes that were run before, with the same checkpoint, are not run again.
+    Scenes that were run before, with the same checkpoint and planners, are not run again.
     """
+    check_whole("jobs", jobs, 1)
     out = Path(out)
-    note, described = out / "planning.json", {"vector": float(np.abs(training.load_run(checkpoint).vector).sum())}
+    note = out / "planning.json"
+    described = plain({"vector": float(np.abs(training.load_run(checkpoint).vector).sum()), "planners": PLANNERS,
+                       "search": asdict(planning.Search()), "pokes": POKES, "ahead": AHEAD,
+                       "settings": asdict(control.SETTINGS)})
     if note.exists() and json.loads(note.read_text()) != described:
-        raise ValueError(f"{out}: holds runs of another checkpoint; choose another --out")
+        raise ValueError(f"{out}: holds runs of another checkpoint or other planners; choose another --out")
     write_json(note, described)
-    todo = [(planner, movers, seed, 0) for planner in PLANNERS for movers in OBJECTS for seed in range(scenes)]
+    seeds = [seed for seed in range(scenes + 1) if seed != TRAIN_SEED][:scenes]
+    todo = [(planner, movers, seed, 0) for planner in PLANNERS for movers in OBJECTS for seed in seeds]
     todo += [(planner, 0, seed, attempt) for planner in ("learned", "greedy") for seed in range(OBSTACLE_SCENES)
              for attempt in range(OBSTACLE_TRIES)]
     results = run_all(partial(run_scene, checkpoint, out), todo, jobs)
-    curves = {(planner, movers): np.array([results[planner, movers, seed, 0]["distance_m"] for seed in range(scenes)])
+    curves = {(planner, movers): np.array([results[planner, movers, seed, 0]["distance_m"] for seed in seeds])
               for planner in PLANNERS for movers in OBJECTS}
     return summarise_planning(results, curves), curves
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from . import worker_pool
+from . import check_whole, worker_pool
 from .geometry import Camera, look_at
 from .interactions import (OCCUPIED, Interactions, Truth, cell_centres, cells_of, find_shards, grid_shape, load_shard,
                            save_shard, standing, truth_path)
@@ -430,8 +430,7 @@ def collect(folder, pokes, seed, settings=Settings(), jobs=1, progress=None):
     Raises ValueError for bad counts or a folder with other data in it.
     """
     for name, value, least in (("pokes", pokes, 1), ("jobs", jobs, 1), ("seed", seed, 0)):
-        if not isinstance(value, int) or value < least:
-            raise ValueError(f"{name}: expected a whole number >= {least}, got {value}")
+        check_whole(name, value, least)
     folder, start = Path(folder), time.perf_counter()
     sizes = {f"shard_{i:04d}.npz": min(SHARD_POKES, pokes - first)
              for i, first in enumerate(range(0, pokes, SHARD_POKES))}

@@ -13,8 +13,8 @@ import numpy as onp
 from autograd import grad
 from autograd.tracer import getval
 
-from . import losses, worker_pool
-from .geometry import free_radius, optical_flow, ray_spacing
+from . import check_whole, losses, worker_pool
+from .geometry import Camera, free_radius, optical_flow, ray_spacing
 from .interactions import (add_depth_noise, associate_with_noise, cell_centres, cells_of, load_npz, occupied_pixels,
                            points_and_validity, save_npz, smooth_depth, true_scene_flow)
 from .networks import (Sizes, encode, forward_model, init_parameters, inverse_model, most_changed, state_embedding,
@@ -63,7 +63,10 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
     if mirror.any() and not camera.is_mirror_symmetric:
-        raise ValueError("mirror: this data set's camera is not symmetric about the arena's plane x = 0")
+        raise ValueError("mirror: this data set's camera is not symmetric about the arena's plane x = 0, so Recipe.mirror "
+                         "must be False")
+    if (depth_noise or image_noise) and rng is None:
+        raise ValueError("rng: expected a random generator to draw the noise from")
     depth, rgb = (onp.stack([getattr(interactions, f"{kind}_{when}")[rows] for when in ("before", "after")])
                   for kind in ("depth", "rgb"))  # (2, B, ...)
     pokes, starts = interactions.pokes[rows], interactions.starts[rows]
@@ -220,11 +223,10 @@ class Recipe:
     association: int = 0
 
     def __post_init__(self):
-        if self.association < 0 or self.association and self.association % 2 == 0:
+        for name, least in (("steps", 1), ("batch", 1), ("warmup", 0), ("seed", 0), ("association", 0)):
+            check_whole(name, getattr(self, name), least)
+        if self.association and self.association % 2 == 0:
             raise ValueError(f"association: expected 0 or an odd number of pixels, got {self.association}")
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a whole number >= 1, got {getattr(self, name)}")
         if not 0 < self.learning_rate < float("inf"):
             raise ValueError(f"learning_rate: expected a finite number > 0, got {self.learning_rate}")
         for name in ("depth_noise", "image_noise"):
@@ -345,6 +347,13 @@ def training_step(interactions, run, gradients, truth=None):
             run.sums[name] = run.sums.get(name, 0.0) + value
 
 
+def check_camera(run, camera):
+    """Raise ValueError when a run was trained with another camera than this one."""
+    trained = Camera(**run.meta["camera"])
+    if not all(onp.allclose(getattr(trained, name), getattr(camera, name), rtol=1e-6) for name in vars(camera)):
+        raise ValueError("camera: another camera than the checkpoint was trained with")
+
+
 def train(interactions, run, jobs=1, on_epoch=None, on_step=None, truth=None):
     """Go on with a run to its recipe's last step; updates and returns it.
 
@@ -353,10 +362,8 @@ def train(interactions, run, jobs=1, on_epoch=None, on_step=None, truth=None):
     on `jobs` (if BLAS has one thread here as in the workers: import the package before NumPy).
     Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
     """
-    if interactions.meta["camera"] != run.meta["camera"]:
-        raise ValueError("interactions: taken with another camera than the run's")
-    if jobs < 1:
-        raise ValueError(f"jobs: expected a whole number >= 1, got {jobs}")
+    check_camera(run, interactions.camera)
+    check_whole("jobs", jobs, 1)
     if bool(run.recipe.association) != (truth is not None):
         raise ValueError("truth: expected for SE3-Nets (Recipe.association), and for nothing else")
     recipe, per_epoch = run.recipe, max(1, len(interactions) // run.recipe.batch)

@@ -158,6 +158,20 @@ def test_greedy_pokes_what_is_farthest_from_its_goal(farthest, shift):
     assert abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.radians(50)
 
 
+def test_an_arena_that_becomes_empty_ends_the_loop_and_loses_nothing(run, monkeypatch):
+    real, calls = planning.view_of, []
+
+    def empty(*arguments):
+        calls.append(1)
+        if len(calls) > 1:
+            raise planning.NoPoke("scene: no object stands in the arena")
+        return real(*arguments)
+    monkeypatch.setattr(planning, "view_of", empty)
+    with control.random_task(0, 1) as task:
+        record = control.closed_loop(task, run, "random", SMALL, budget=3)
+    assert len(record["pokes"]) == 1 and len(record["rgb"]) == len(record["poses"]) == len(record["marks"]) == 2
+
+
 def test_no_poke_left_ends_the_loop_and_loses_nothing(run, monkeypatch):
     next_poke, calls = control.next_poke, []
 

@@ -393,6 +393,16 @@ def test_save_sequence_draws_the_pokes_that_have_a_start(tmp_path, monkeypatch):
     assert drawn == [(2, 3, 6, 7)]
 
 
+@pytest.mark.parametrize("name", ["marks", "goals", "arrows", "distances"])
+def test_save_sequence_names_what_does_not_fit(tmp_path, name):
+    arguments = {"arrows": np.zeros((2, 2, 2)), "marks": np.zeros((3, 1, 2)), "goals": np.zeros((1, 2)),
+                 "distances": np.zeros(3)}
+    arguments[name] = arguments[name][..., None]
+    with pytest.raises(ValueError, match=name):
+        figures.save_sequence(tmp_path / "plan.gif", np.zeros((3, 12, 16, 3)), None, **arguments)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_failed_save_sequence_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     from matplotlib.animation import PillowWriter
     a_sequence(tmp_path / "plan.gif")

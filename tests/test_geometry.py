@@ -205,6 +205,11 @@ def test_project_inverts_unproject():
     np.testing.assert_allclose(pixels, np.broadcast_to(np.stack([u, v], axis=-1), pixels.shape), atol=1e-10)
 
 
+def test_project_refuses_points_in_whole_numbers():
+    with pytest.raises(ValueError, match="points: expected floating-point metres, got int64"):
+        project(np.array([[0, 0, 0], [0, 0, 1]]), make_camera())
+
+
 def test_project_matches_opencv():
     camera, points = make_camera(), cloud(np.random.default_rng(5), 2, 6)
     pixels = project(points, camera)

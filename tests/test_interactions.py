@@ -43,7 +43,7 @@ def make_interactions(seed=0, count=3, camera=None, settings=SETTINGS):
         depth_before=make_depth(rng, count, *size), depth_after=make_depth(rng, count, *size),
         pokes=rng.uniform(-0.2, 0.2, (count, 3)).astype(np.float32),
         starts=rng.uniform(-0.2, 0.2, (count, 2)).astype(np.float32),
-        empty_depth=make_depth(rng, *size), camera=camera,
+        empty_depth=make_depth(np.random.default_rng(7), *size), camera=camera,
         meta={"seed": seed, "shard": 0, "settings": settings, "counts": {"kept": count, "left_arena": 2}})
 
 
@@ -433,11 +433,21 @@ def test_load_interactions_joins_in_order(tmp_path):
 
 @pytest.mark.parametrize("changed", [dict(camera=make_camera(fx=9.8)),
                                      dict(camera=make_camera(arena_from_camera=look_at((0, -0.46, 0.62), (0, 0, 0)))),
-                                     dict(settings={"arena": 0.5, "cell": 0.05})], ids=["fx", "pose", "grid"])
+                                     dict(settings={"arena": 0.5, "cell": 0.05}),
+                                     dict(settings={"arena": 0.4, "cell": 0.02})],
+                         ids=["fx", "pose", "grid", "arena"])
 def test_load_interactions_refuses_a_mixture(tmp_path, changed):
     write(tmp_path, 0)
     write(tmp_path, 1, **changed)
     with pytest.raises(ValueError, match="shard_0001.npz"):
+        load_interactions(tmp_path)
+
+
+def test_load_interactions_refuses_shards_of_two_empty_arenas(tmp_path):
+    write(tmp_path, 0)
+    path = write(tmp_path, 1)
+    rewrite(path, {"empty_depth": load_npz(path, FORMAT)[0]["empty_depth"] + np.uint16(500)})
+    with pytest.raises(ValueError, match="shard_0001.npz: another"):
         load_interactions(tmp_path)
 
 
@@ -497,6 +507,18 @@ def test_interactions_check_their_arrays():
         replace(good, pokes=good.pokes[:, :2])
     with pytest.raises(ValueError, match="empty_depth"):
         replace(good, empty_depth=good.empty_depth.T)
+
+
+@pytest.mark.parametrize("name, dtype", [("rgb_after", float), ("depth_before", np.uint16), ("pokes", int)])
+def test_interactions_refuse_other_types(name, dtype):
+    good = make_interactions()
+    with pytest.raises(ValueError, match=f"{name}: expected .*, got {np.dtype(dtype)}"):
+        replace(good, **{name: getattr(good, name).astype(dtype)})
+
+
+def test_a_single_row_is_no_selection():
+    with pytest.raises(TypeError, match="rows"):
+        make_interactions()[0]
 
 
 def test_grid_shape_comes_from_the_settings():

@@ -145,6 +145,12 @@ def test_wrong_input_ends_in_one_line(tmp_path, capsys):
         (("train", data_small() / "train", out, "--masks", 1), ("masks",)),
         (("train", data_small() / "train", out, "--jobs", 0), ("jobs",)),
         (("train", data_small() / "train", out, "--resume"), ("model.npz", "no such file")),
+        (("train", data_small() / "train", tmp_path / "model.png"), ("out", ".npz", "model.png")),
+        (("train", data_small() / "train"), ("out", ".npz")),
+        (("train", data_small() / "train", out, "--seed", -1), ("seed", "-1")),
+        (("reproduce", "planning", "--out", tmp_path / "p", "--jobs", 0), ("jobs", "0")),
+        (("plan", "--seed", -1), ("seed", "-1")),
+        (("plan", "--objects", 2, "--obstacle"), ("movers", "obstacle")),
         (("collect", tmp_path / "c", "--pokes", -5), ("pokes", "-5")),
         (("collect", tmp_path / "c", "--objects", 0, 3), ("objects",)),
         (("collect", tmp_path / "c", "--kinds", "teapot"), ("kinds", "teapot")),
@@ -186,6 +192,28 @@ def test_options_of_train_are_those_of_the_recipe(tmp_path):
     recipe = training.load_run(tmp_path / "a.npz").recipe
     assert (recipe.steps, recipe.batch, recipe.depth_noise, recipe.seed) == (3, 2, 0.004, 5)
     assert (recipe.sizes.width, recipe.sizes.masks) == (8, 3)
+
+
+def test_resuming_keeps_the_recipe_and_refuses_another(tmp_path, capsys):
+    out = tmp_path / "model.npz"
+    assert run("train", data_small() / "train", out, *TRAIN) == 0
+    capsys.readouterr()
+    one_line(capsys, run("train", data_small() / "train", out, "--weight", "inverse=0", "--resume"), "--resume",
+             "weight")
+    assert run("train", data_small() / "train", out, "--resume") == 0
+    assert training.load_run(out).recipe.batch == 2
+
+
+def test_a_camera_that_is_not_symmetric_is_trained_without_mirroring(tmp_path):
+    from dataclasses import replace
+
+    from hind4sight_min.interactions import load_interactions, load_truth, save_shard
+    data, truth = load_interactions(data_small() / "train")[:4], load_truth(data_small() / "train")[:4]
+    data.camera = replace(data.camera, cx=data.camera.cx + 0.3)
+    save_shard(tmp_path / "shard_0000.npz", data, truth)
+    assert run("train", tmp_path, tmp_path / "model.npz", *TRAIN) == 0
+    assert not training.load_run(tmp_path / "model.npz").recipe.mirror
+    assert training.load_run(data_small() / "checkpoint.npz").recipe.mirror
 
 
 def test_a_checkpoint_of_another_camera_is_refused(tmp_path, capsys):

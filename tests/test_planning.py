@@ -163,9 +163,9 @@ def test_empty_scenes_are_refused(pokes):
 
 
 def test_a_checkpoint_of_another_camera_is_refused(run):
-    planning.check_camera(run, CAMERA)
+    training.check_camera(run, CAMERA)
     with pytest.raises(ValueError, match="another camera"):
-        planning.check_camera(run, replace(CAMERA, fx=CAMERA.fx + 1))
+        training.check_camera(run, replace(CAMERA, fx=CAMERA.fx + 1))
 
 
 # --- actions --------------------------------------------------------------------------------------------------

@@ -81,6 +81,14 @@ def test_a_run_of_another_recipe_is_not_gone_on_with(tmp_path, small_world):
         reproduce.run_cell(cell, tmp_path, replace(TINY_SCALE, steps=5))
 
 
+def test_the_figures_of_another_recipe_are_not_taken(tmp_path, small_world, monkeypatch):
+    cell = Cell("full", "clean", 1)
+    found = reproduce.run_cell(cell, tmp_path, TINY_SCALE)
+    assert reproduce.run_cell(cell, tmp_path, TINY_SCALE) == found
+    with pytest.raises(ValueError, match="full-clean-1.json: made with another recipe"):
+        reproduce.run_cell(cell, tmp_path, replace(TINY_SCALE, steps=5))
+
+
 def test_a_cell_is_evaluated_under_the_noise_it_was_trained_with(tmp_path, small_world, monkeypatch):
     told = []
     monkeypatch.setattr(evaluation, "evaluate", lambda *_, depth_noise=0.0: told.append(depth_noise) or {})

@@ -268,6 +268,18 @@ def test_every_epoch_shows_every_row_once():
     np.testing.assert_array_equal(np.bincount(training.rows_of_step(replace(TINY, batch=20), 7, 0)[0]) >= 2, True)
 
 
+def test_a_batch_with_noise_needs_a_generator():
+    with pytest.raises(ValueError, match="rng"):
+        make_batch(pokes_seen(), np.arange(2), depth_noise=0.01)
+
+
+@pytest.mark.parametrize("name, bad", [("batch", 2.5), ("steps", np.nan), ("association", 1.5), ("seed", -1),
+                                       ("warmup", -1)])
+def test_recipe_refuses_what_is_no_whole_number(name, bad):
+    with pytest.raises(ValueError, match=f"{name}: expected a whole number"):
+        replace(TINY, **{name: bad})
+
+
 def test_half_of_the_interactions_are_shown_mirrored():
     flags = np.array([training.rows_of_step(TINY, 7, step)[1] for step in range(200)])
     assert 0.45 < flags.mean() < 0.55
