@@ -4,7 +4,8 @@ Every network is the same small perceptron applied to each point, plus *context*
 a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
 once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
 
-The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. Box of Fig. 3 -> function here (its layers):
+The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. Box of Fig. 3 -> function here
+(its layers):
     encoder, siamese             `encode` (encoder_*), one point at a time; `state_embedding`, its mean
     poke                         `poke_frame`: not an input of its own but the frame that points are given in
     decoder of masks             `forward_model` (trunk_*, context_*, shape_*, mask)
@@ -278,8 +279,9 @@ def most_changed(points, next_points, valid):
     """Where the two clouds differ, pixel by pixel: the evidence of a poke.
 
     points, next_points (B, N, 3) m; valid (B, N) bool, depth in both -> the M most changed points before and after,
-    (B, M, 3) each, and their weights (B, M), summing to 1 (0 where nothing changed). The weight is |P_{t+1} - P_t|^4: the power keeps the many
-    small differences of a noisy depth picture from outvoting the few large ones.
+    (B, M, 3) each, and their weights (B, M), summing to 1 (0 where nothing changed). The weight is
+    |P_{t+1} - P_t|^4: the power keeps the many small differences of a noisy depth picture from outvoting the few large
+    ones.
     """
     change = onp.sum((next_points - points) ** 2, axis=2) ** 2 * valid
     count = min(CHANGED_POINTS, change.shape[1])

@@ -190,9 +190,10 @@ def reproduce(tables, out, scale, jobs=1, progress=None):
     return figures
 
 
-METRICS = ("flow_mse_cm2", "flow_mse_ratio", "flow_epe_cm", "no_motion_epe_cm", "still_epe_cm", "mask_iou", "optical_epe_px", "optical_epe_all_px",
-           "inverse_target_cm", "inverse_direction_deg", "no_motion_mse_cm2", "no_motion_optical_epe_px",
-           "no_motion_optical_epe_all_px", "unseen_flow_mse_ratio", "unseen_mask_iou", "train_seconds")
+METRICS = ("flow_mse_cm2", "flow_mse_ratio", "flow_epe_cm", "no_motion_epe_cm", "still_epe_cm", "mask_iou",
+           "optical_epe_px", "optical_epe_all_px", "inverse_target_cm", "inverse_direction_deg", "no_motion_mse_cm2",
+           "no_motion_optical_epe_px", "no_motion_optical_epe_all_px", "unseen_flow_mse_ratio", "unseen_mask_iou",
+           "train_seconds")
 
 
 def summarise(results, scale):

@@ -63,8 +63,8 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
     if mirror.any() and not camera.is_mirror_symmetric:
-        raise ValueError("mirror: this data set's camera is not symmetric about the arena's plane x = 0, so Recipe.mirror "
-                         "must be False")
+        raise ValueError("mirror: expected False (in the Recipe), for this data set's camera is not symmetric about the "
+                         "arena's plane x = 0")
     if (depth_noise or image_noise) and rng is None:
         raise ValueError("rng: expected a random generator to draw the noise from")
     depth, rgb = (onp.stack([getattr(interactions, f"{kind}_{when}")[rows] for when in ("before", "after")])

@@ -138,8 +138,8 @@ def test_settings_accept_their_limits():
 
 
 @pytest.mark.parametrize("changed", [
-    dict(arena=-0.5), dict(arena=float("nan")), dict(arena=0.6), dict(cell=0), dict(cell=0.03), dict(poke_length=(0.18, 0.14)), dict(poke_length=0.16),
-    dict(objects_min=1.5), dict(pokes_per_scene=0),
+    dict(arena=-0.5), dict(arena=float("nan")), dict(arena=0.6), dict(cell=0), dict(cell=0.03),
+    dict(poke_length=(0.18, 0.14)), dict(poke_length=0.16), dict(objects_min=1.5), dict(pokes_per_scene=0),
     dict(pokes_per_scene=2.5),
     dict(finger_speed=0.0), dict(place_within=3.0)], ids=str)
 def test_settings_that_cannot_work_are_refused(changed):
