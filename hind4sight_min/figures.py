@@ -155,10 +155,10 @@ def _draw_flows(panels, flows):
 
 def _draw_error(figure, axes, image, warped, flow, shared):
     """The photometric error of each pixel; grey where the flow leaves the picture or the pixel is not `shared`."""
-    (height, width), margin = shared.shape, 0.01  # px: rounding alone carries no pixel of the rim out of view
+    (height, width), margin = shared.shape, 1e-3  # px, as in losses.warp_backward
     v, u = np.mgrid[:height, :width]
     x, y = u + flow[..., 0], v + flow[..., 1]
-    counted = shared & (x > -margin) & (x < width - 1 + margin) & (y > -margin) & (y < height - 1 + margin)
+    counted = shared & (x >= -margin) & (x <= width - 1 + margin) & (y >= -margin) & (y <= height - 1 + margin)
     error = np.abs(image - warped).sum(axis=-1)  # Eq. (3) before the sum over pixels
     shown = show_image(axes, np.ma.array(error, mask=~counted), "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\n"
                        "grey: not counted", cmap=MAGMA, vmin=0, vmax=max(0.1, (error * counted).max()))
