@@ -312,7 +312,10 @@ def term_weight(text):
     name, _, value = text.partition("=")
     if name not in training.WEIGHTS:
         raise argparse.ArgumentTypeError(f"expected TERM=VALUE with one of {', '.join(training.WEIGHTS)}, got {text!r}")
-    return name, float(value)
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected TERM=VALUE with a number, got {text!r}") from None
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -376,7 +379,8 @@ def build_parser():
     search = planning.Search()
     sub = command("plan", run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)")
     sub.add_argument("checkpoint", nargs="?", default=small / "checkpoint.npz")
-    sub.add_argument("--seed", type=int, default=0, help="which test scene")
+    sub.add_argument("--seed", type=int, default=0, help=f"which scene ({reproduce.TRAIN_SEED} has objects that the "
+                     "shipped model was trained on)")
     sub.add_argument("--objects", type=int, default=1, choices=(1, 2, 3), help="how many are to be moved")
     sub.add_argument("--obstacle", action="store_true", help="a scene with another object in the way")
     sub.add_argument("--mark", type=float, nargs=2, action="append", metavar=("X", "Y"),

@@ -231,6 +231,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
+    check_whole("budget", budget, 1)
     arena, rng = task.arena, np.random.default_rng(seed)
     camera, empty, settings = arena.camera, arena.empty_depth, asdict(arena.settings)
     check_camera(run, camera)

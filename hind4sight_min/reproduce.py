@@ -282,7 +282,7 @@ def optical_table(figures):
         if f"{peer}_optical_epe_px" in figures:
             lines.append(f"| {peer} (FlowNet 2.0 in the paper) | both pictures | {OPTICAL_PAPER['peer']} | "
                          f"{figures[f'{peer}_optical_epe_px']:.2f} | {figures[f'{peer}_optical_epe_all_px']:.4f} |")
-    lines.append(f"| full model | depth and poke | {OPTICAL_PAPER['full']} | "
+    lines.append(f"| full model, trained long | depth and poke | {OPTICAL_PAPER['full']} | "
                  f"{_pm(figures, 'full_clean_long_optical_epe_px')} | "
                  f"{_pm(figures, 'full_clean_long_optical_epe_all_px', '{:.4f}')} |")
     lines.append(f"| no motion | | | {figures['full_clean_long_no_motion_optical_epe_px']:.2f} | "

@@ -63,7 +63,7 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     camera, settings = interactions.camera, interactions.meta["settings"]
     mirror = onp.broadcast_to(mirror, len(rows))
     if mirror.any() and not camera.is_mirror_symmetric:
-        raise ValueError("mirror: expected False (in the Recipe), for this data set's camera is not symmetric about the "
+        raise ValueError("mirror: expected False (in the Recipe): this data set's camera is not symmetric about the "
                          "arena's plane x = 0")
     if (depth_noise or image_noise) and rng is None:
         raise ValueError("rng: expected a random generator to draw the noise from")

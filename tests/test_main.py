@@ -150,6 +150,7 @@ def test_wrong_input_ends_in_one_line(tmp_path, capsys):
         (("train", data_small() / "train", out, "--seed", -1), ("seed", "-1")),
         (("reproduce", "planning", "--out", tmp_path / "p", "--jobs", 0), ("jobs", "0")),
         (("plan", "--seed", -1), ("seed", "-1")),
+        (("plan", "--budget", 0, "--out", tmp_path / "p"), ("budget", "0")),
         (("plan", "--objects", 2, "--obstacle"), ("movers", "obstacle")),
         (("collect", tmp_path / "c", "--pokes", -5), ("pokes", "-5")),
         (("collect", tmp_path / "c", "--objects", 0, 3), ("objects",)),

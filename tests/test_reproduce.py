@@ -254,7 +254,7 @@ def test_the_whole_command_on_next_to_nothing(tmp_path, monkeypatch, capsys):
     arguments = ["reproduce", "optical-flow", "--quick", "--out", str(tmp_path), "--jobs", "2"]
     assert main(arguments) == 0
     first = capsys.readouterr().out
-    assert "4 of 4" in first and "| full model | depth and poke |" in first
+    assert "4 of 4" in first and "| full model, trained long | depth and poke |" in first
     figures = json.loads((tmp_path / "optical-flow.json").read_text())
     assert figures["full_clean_long_flow_mse_ratio"] == pytest.approx(1, abs=0.1)  # one step: hardly any motion
     assert 0 < figures["optical_epe_over_best_peer_all"] < np.inf

@@ -158,7 +158,7 @@ lesson.keep(options, figure, "gradient")
 # ## How far does the slope reach, and what does noise do to it?
 #
 # Move the object by 0 to 2 times its true motion and draw the Chamfer distance. Then add the paper's depth noise: a
-# standard deviation of 1 cm at every pixel, drawn anew for each picture. Now every table point finds a *spurious
+# standard deviation of 1 cm at the median depth, drawn anew for each picture. Now every table point finds a *spurious
 # match*, whatever the object does: noise lifts the whole curve. What matters is whether its minimum stays where it
 # was.
 

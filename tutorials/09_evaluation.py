@@ -131,9 +131,9 @@ figure.suptitle("Every number beside what it has to beat: no motion, chance, flo
 lesson.keep(options, figure, "errors")
 
 # %% [markdown]
-# Pokes that hardly move anything have tiny motions to divide by, and a millimetre of error becomes a ratio above 1.
-# The mean of ratios is mostly about these. The pooled ratio weighs each poke by how much it moved. Neither is
-# wrong; a table must say which one it gives. `evaluation.evaluate` pools.
+# Pokes that hardly move anything have tiny motions to divide by. The few that move less than a centimetre hold under
+# 1 % of the squared motion, and make more than half of the mean of ratios. The pooled ratio weighs each poke by how
+# much it moved. Neither is wrong; a table must say which one it gives. `evaluation.evaluate` pools.
 #
 # Farneback and DIS are two methods for optical flow that see *both* pictures and no poke; ours sees the first
 # picture's depth and the poke. Over all points both are worse than no motion: without texture, as on the table,
@@ -169,7 +169,7 @@ for panel, name, baseline, title in (
         panel.legend(fontsize=9, loc="upper left")
     panel.set(xlabel="depth noise, SD [cm]", ylim=(0, 1.3 * (baseline or 0.77)))
     panel.set_title(title, fontsize=10)
-figure.suptitle("Trained without noise: half a centimetre hardly matters to the flow, but to the inverse model",
+figure.suptitle("Trained without noise: half a centimetre costs the inverse model more than the flow",
                 fontsize=11)
 lesson.keep(options, figure, "noise")
 
@@ -216,11 +216,12 @@ figure.suptitle(f"After {STEPS} steps: 2D alone has hardly begun; 3D and full ar
 lesson.keep(options, figure, "ablation")
 
 # %% [markdown]
-# What does this small budget show? That the 2D terms alone get off the ground last: pictures say little while the
-# motion is far from the truth (tutorial 04). And that only the full model learns the heat-maps; the other two have no
-# loss for them. What does it *not* show? Whose flow is best in the end. All are far from the shipped model, and in its
-# cold start the full model has the 2D terms to carry. For that question there is `hind4sight reproduce ablation`:
-# thousands of steps, three seeds per model, a mean and a standard deviation.
+# What does this small budget show? That the 2D terms alone get off the ground last: a new network's masks are
+# everywhere, and to move all still edges costs more than to move the object gains (tutorial 08). And that only the
+# full model learns the heat-maps; the other two have no loss for them. What does it *not* show? Whose flow is best in
+# the end. All are far from the shipped model, and in its cold start the full model has the 2D terms to carry. For
+# that question there is `hind4sight reproduce ablation`: thousands of steps, three seeds per model, a mean and a
+# standard deviation.
 #
 # **Now change this:** set `NOISE = "noisy"`, which trains and evaluates with 1 cm of depth noise. In the paper's
 # Table I the 3D terms alone fail there. Can this budget tell? And how do the ratios compare with the shipped

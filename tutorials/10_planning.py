@@ -139,7 +139,7 @@ lesson.keep(options, figure, "population")
 # ## The closed loop
 #
 # The world does not do quite what the model says. So only the first poke is carried out; then the robot looks again
-# and plans anew, until the goal is reached, no poke is predicted to help, or ten pokes are spent. Between two
+# and plans anew, until the goal is reached, no poke is predicted to help, or six pokes are spent. Between two
 # pictures it must find the marked point again: `planning.follow` starts from the motion that the model predicts for
 # the mark's mask and corrects it by registering the two pictures.
 
@@ -174,7 +174,8 @@ if simulator:
 # %% [markdown]
 # **Now change this:** give the search one of its terms alone, `planning.Search(chamfer_weight=0.0)` or
 # `planning.Search(pixel_weight=0.0)`, and look at what is left after the loop, and at how the object is turned. Then
-# try three objects: `control.random_task(0, 3)`. docs/results/planning.json has both for sixty scenes.
+# try three objects: `control.random_task(0, 3)` in both calls of the closed loop. docs/results/planning.json has both
+# for sixty scenes.
 
 # %% Check
 print("5. Check")
