@@ -125,7 +125,9 @@ def run_train(args):
     if args.resume:
         run = training.load_run(args.out)
         if given:
-            raise ValueError(f"--resume: goes on with the recipe of {args.out}, which --{min(given)} cannot change")
+            option = min(given).replace("_", "-")
+            raise ValueError(f"--resume: goes on with the recipe of {args.out}, which "
+                             f"--{option} cannot change")
     else:
         if Path(args.out).exists():
             raise ValueError(f"{args.out}: exists already; --resume goes on with it")
