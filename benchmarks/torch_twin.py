@@ -108,7 +108,8 @@ def forward_model(p, sizes, points, valid, pokes):
     moving = masks[..., 1:] * valid[..., None]
     share = (moving / (moving.sum(dim=1, keepdim=True) + 1e-3)).transpose(1, 2)
     pooled, centroids = share @ h, share @ local
-    x = torch.cat([pooled, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1], dim=2)
+    tops = torch.stack([(h * moving[..., k:k + 1]).amax(dim=1) for k in range(moving.shape[2])], dim=1)
+    x = torch.cat([pooled, tops, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1], dim=2)
     x = torch.relu(linear(p, "motion_2", torch.relu(linear(p, "motion_1", x))))
     twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", x)
     turn = so3_exp(twist[..., 3:])
@@ -121,8 +122,8 @@ def forward_model(p, sizes, points, valid, pokes):
     blended = masks @ torch.cat([still, motions], dim=1)
     predicted = (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:]
 
-    change = torch.relu(linear(p, "next_1", torch.cat([state, seen], dim=1)))
-    return predicted, masks, state + linear(p, "next_2", change) / networks.CHANGE_GAIN
+    change = linear(p, "next", torch.cat([state, seen], dim=1))
+    return predicted, masks, state + change / networks.CHANGE_GAIN
 
 
 def inverse_model(p, before, after, weights, cells):

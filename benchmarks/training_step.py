@@ -2,7 +2,7 @@
 
     python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
 
-Every contender makes the same steps on the same pokes: batch, forward, losses, backward, Adam. BLAS has one thread in
+Every contender makes the same steps on the same pokes: batch, forward, losses, backward, optimiser. BLAS has one thread in
 our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
 fastest median counts. Memory is the peak, a worker's own pages added to its parent's (Linux only).
 
@@ -50,7 +50,10 @@ def twin(batch, chamfer, mode, threads):
     recipe = training.Recipe(steps=10 ** 6, batch=batch)
     run = training.start_run(recipe, data)
     params = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in run.params.items()}
-    optimiser = torch.optim.Adam(params.values(), lr=recipe.learning_rate)
+    # Muon for matrices, Adam for the rest, as ours
+    optimisers = [torch.optim.Muon([each for each in params.values() if each.ndim == 2], lr=recipe.learning_rate,
+                                   momentum=0.9, weight_decay=0, adjust_lr_fn="match_rms_adamw"),
+                  torch.optim.Adam([each for each in params.values() if each.ndim == 1], lr=recipe.learning_rate)]
     nearest = {"tree": torch_twin.nearest_by_tree, "brute": torch_twin.nearest_by_brute_force}[chamfer]
     if mode == "compiled":
         nearest = torch.compiler.disable(nearest)
@@ -59,9 +62,11 @@ def twin(batch, chamfer, mode, threads):
     def step():
         rows, mirror, _ = training.rows_of_step(recipe, len(data), run.step)
         tensors = torch_twin.tensors(training.make_batch(data, rows, mirror))
-        optimiser.zero_grad()
+        for optimiser in optimisers:
+            optimiser.zero_grad()
         loss(params, recipe.sizes, tensors, data.camera, training.WEIGHTS, nearest).backward()
-        optimiser.step()
+        for optimiser in optimisers:
+            optimiser.step()
         run.step += 1
     yield step
 

@@ -353,7 +353,7 @@ def build_parser():
     sub = command("train", run_train, "train the full model (Eq. 6) on a folder of shards, without labels")
     sub.add_argument("data", nargs="?", default=small / "train")
     sub.add_argument("out", help="checkpoint to write (.npz); its log goes beside it (.csv and .png)")
-    sub.add_argument("--steps", type=int, help=f"of Adam ({recipe.steps})")
+    sub.add_argument("--steps", type=int, help=f"of the optimiser ({recipe.steps})")
     sub.add_argument("--batch", type=int, help=f"interactions per step ({recipe.batch})")
     sub.add_argument("--learning-rate", type=float, help=f"at its peak ({recipe.learning_rate})")
     sub.add_argument("--weight", type=term_weight, action="append", metavar="TERM=VALUE",

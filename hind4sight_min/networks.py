@@ -10,7 +10,7 @@ The paper's forward model is that of SE3-Nets with a projection layer; ours is s
     poke                         `poke_frame`: not an input of its own but the frame that points are given in
     decoder of masks             `forward_model` (trunk_*, context_*, shape_*, mask)
     decoder of SE(3) motions     `_motions` (motion_*), from the features under each mask; the background's is fixed
-    next state embedding         `forward_model` (next_*)
+    next state embedding         `forward_model` (next)
     inverse model, heat-maps     `inverse_model` (change_*, cell_*, heatmaps), from what `most_changed` finds
 Ours alone: `windows`, `height_map`, `pooling_weights`, `most_changed`, and all constants.
 """
@@ -22,7 +22,7 @@ from autograd.tracer import getval
 
 from . import check_whole
 from .geometry import project, so3_exp, transform_layer
-from .ops import dense, pool, softmax, take, weighted_means
+from .ops import dense, pool, softmax, take, weighted_maxima, weighted_means
 
 
 @dataclass(frozen=True)
@@ -170,11 +170,10 @@ def init_parameters(sizes, rng, dtype=onp.float32):
         del params[f"trunk_{i}_b"]
     add("mask", width, sizes.masks - 1, gain=0.01)
     params["mask_b"] -= 1  # background first
-    add("motion_1", 5 * width + 3, head)
+    add("motion_1", 6 * width + 3, head)
     add("motion_2", head, head)
     add("motion_3", head, 6, gain=0.0)
-    add("next_1", embedding + 4 * width, width)
-    add("next_2", width, embedding, gain=0.0)
+    add("next", embedding + 4 * width, embedding, gain=0.0)
     add("change_1", 2 * 20 + 2 * embedding + 1, inverse)
     add("change_2", inverse, inverse)
     add("cell_context_1", 4 * inverse, inverse)
@@ -231,7 +230,7 @@ def forward_model(params, sizes, points, valid, pokes):
         h = dense(h, params[f"trunk_{i}_w"], bias, relu=True, residual=True)
     seen = context(h)
 
-    # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (Adam
+    # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (it
     # overshoots) would have no gradient left to come back with.
     logits = np.clip(layer(params, "mask", h, relu=False) / MASK_BOUND, -20, 20)  # tanh is flat there: no overflow
     movers = MASK_BOUND * np.tanh(logits)
@@ -241,14 +240,14 @@ def forward_model(params, sizes, points, valid, pokes):
     axes, _ = poke_axes(pokes.astype(points.dtype))
     predicted = points + np.matmul(moved - local, onp.swapaxes(axes, 1, 2))
 
-    change = layer(params, "next_1", np.concatenate([state, seen], axis=1))
-    embedding = state + layer(params, "next_2", change, relu=False) / CHANGE_GAIN
+    change = layer(params, "next", np.concatenate([state, seen], axis=1), relu=False)
+    embedding = state + change / CHANGE_GAIN
     return Prediction(predicted, masks, rotations, translations, embedding)
 
 
-# Of [translation, rotation], in m and rad. Adam moves every weight by the learning rate, whatever the gradient, and
-# a motion is a sum over `head` of them: with 5 cm and 1 rad the first steps fling the points about, and the masks
-# withdraw from that within a hundred steps.
+# Of [translation, rotation], in m and rad. The optimiser moves every weight by the learning rate, however small its
+# gradient, and a motion is a sum over `head` of them: with 5 cm and 1 rad the first steps fling the points about, and
+# the masks withdraw from that within a hundred steps.
 MOTION_UNIT = onp.array([0.005] * 3 + [0.1] * 3, onp.float32)
 
 
@@ -260,9 +259,10 @@ def _motions(params, h, masks, seen, local, valid):
     """
     moving = take(masks, (..., slice(1, None))) * valid[..., None]
     pooled, centroids = weighted_means(h, moving), weighted_means(local, moving)  # (B, K-1, C), (B, K-1, 3)
+    tops = weighted_maxima(h, moving)  # (B, K-1, C): a mean does not see the one corner that the finger meets
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
-    x = layer(params, "motion_1", np.concatenate([pooled, everywhere, centroids / 0.1], axis=2))
+    x = layer(params, "motion_1", np.concatenate([pooled, tops, everywhere, centroids / 0.1], axis=2))
     twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), relu=False)  # (B, K-1, 6)
     turn = so3_exp(take(twist, (..., slice(3, None))))
     turned = np.matmul(turn, centroids[..., None])[..., 0]

@@ -22,7 +22,7 @@ class Scale:
     """train_pokes, test_pokes: how many. steps: of every cell of the tables; long_steps: of the headline models."""
     train_pokes: int = 24000
     test_pokes: int = 1000
-    steps: int = 4500
+    steps: int = 3000
     long_steps: int = 20000
     seeds: tuple = (1, 2, 3)
 

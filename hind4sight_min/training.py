@@ -1,4 +1,4 @@
-"""Unsupervised training: samples, the loss of one interaction, Adam, one loop, checkpoints.
+"""Unsupervised training: samples, the loss of one interaction, the optimiser, one loop, checkpoints.
 
 Only the supervised baseline, SE3-Nets (Recipe.association), is given the simulator's truth.
 """
@@ -198,7 +198,7 @@ ASSOCIATION_WEIGHTS = {"association": 2e3}  # as much as Chamfer, which counts a
 class Recipe:
     """Everything that decides a training run besides the data.
 
-    steps: Adam steps. batch: interactions per step. learning_rate: peak; linear warm-up over `warmup` steps,
+    steps: of the optimiser. batch: interactions per step. learning_rate: peak; linear warm-up over `warmup` steps,
     then a cosine to zero. depth_noise: SD in m of noise added to the depth, Sec. IV-B. image_noise: SD of noise added
     to the images I_t, in [0, 1]; see below. mirror: show half of the interactions mirrored. weights: one per term of
     Eq. (6).
@@ -212,7 +212,7 @@ class Recipe:
     """
     steps: int = 3000
     batch: int = 16
-    learning_rate: float = 2e-3
+    learning_rate: float = 1.5e-3
     warmup: int = 50
     depth_noise: float = 0.0
     image_noise: float = 0.003
@@ -273,14 +273,40 @@ def start_run(recipe, interactions):
                onp.zeros_like(vector), onp.zeros_like(vector), meta=meta)
 
 
-def adam_step(run, gradient, rate, beta1=0.9, beta2=0.999, epsilon=1e-8):
-    """One step of Adam (Kingma and Ba) on the run's vector. Paper: Sec. III-G."""
+def orthogonalised(matrix):
+    """The matrix with all its singular values brought to about 1 (0.7 to 1.2), its singular vectors kept.
+
+    Five Newton-Schulz iterations with the coefficients of Muon (K. Jordan et al., 2024): every singular value s becomes
+    3.4445 s - 4.7750 s^3 + 2.0315 s^5, which lifts the small ones quickest. An SVD, U V^T, takes four times as long.
+    """
+    if matrix.shape[0] > matrix.shape[1]:
+        return orthogonalised(matrix.T).T
+    x = matrix / (onp.linalg.norm(matrix) + onp.float32(1e-12))  # no singular value above 1; a dead layer stays at 0
+    for _ in range(5):
+        square = x @ x.T
+        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
+    return x
+
+
+def optimiser_step(run, gradient, rate, beta1=0.9, beta2=0.999, epsilon=1e-8):
+    """One step on the run's vector: Adam (Kingma and Ba) for vectors, orthogonalised momentum (Muon) for matrices.
+
+    The paper has Adam alone, Sec. III-G, and we had. The gradient of a layer's matrix is dominated by a few directions,
+    and the many others, in which the same pokes would also have it move, hardly move at all. Orthogonalising the
+    momentum gives all of them the same say. It takes a third of the steps (docs/research-log.md). Times
+    sqrt(max(shape)), an entry moves by the rate, in the root mean square, as in Adam's first step.
+    """
     run.step += 1
     run.first_moment += (1 - beta1) * (gradient - run.first_moment)
     run.second_moment += (1 - beta2) * (gradient ** 2 - run.second_moment)
     first = run.first_moment / (1 - beta1 ** run.step)
     second = run.second_moment / (1 - beta2 ** run.step)
-    run.vector = run.vector - onp.float32(rate) * first / (onp.sqrt(second) + onp.float32(epsilon))
+    step = first / (onp.sqrt(second) + onp.float32(epsilon))
+    ahead = unflatten(beta1 * run.first_moment + (1 - beta1) * gradient, run.layout)  # Nesterov's momentum
+    for name, block in unflatten(step, run.layout).items():
+        if block.ndim == 2:
+            block[:] = math.sqrt(max(block.shape)) * orthogonalised(ahead[name])
+    run.vector = run.vector - onp.float32(rate) * step
 
 
 def rows_of_step(recipe, count, step):
@@ -328,7 +354,7 @@ def workers(jobs):
 
 
 def training_step(interactions, run, gradients, truth=None):
-    """One Adam step on the run's next batch; `gradients` comes from `workers`. Adds the batch's terms to run.sums.
+    """One step of the optimiser on the run's next batch; `gradients` comes from `workers`. Adds the batch's terms to run.sums.
 
     Raises FloatingPointError if the gradient is not finite; the run is then as it was.
     """
@@ -341,7 +367,7 @@ def training_step(interactions, run, gradients, truth=None):
     gradient = sum(part[1] for part in parts)
     if not onp.isfinite(gradient).all():
         raise FloatingPointError(f"the gradient is not finite at step {run.step}")
-    adam_step(run, gradient, rate)
+    optimiser_step(run, gradient, rate)
     for terms, _ in parts:
         for name, value in terms.items():
             run.sums[name] = run.sums.get(name, 0.0) + value

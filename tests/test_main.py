@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from hind4sight_min import __main__ as command
-from hind4sight_min import training
+from hind4sight_min import networks, training
 from hind4sight_min.__main__ import data_small, main
+from hind4sight_min.interactions import load_interactions
 
 ROOT = Path(__file__).resolve().parent.parent
 TRAIN = ["--steps", "3", "--batch", "2", "--width", "8", "--jobs", "1"]
@@ -57,6 +58,18 @@ def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp
     out, err = capsys.readouterr()
     assert err == ""  # no progress line away from a terminal
     assert f"{metrics['flow_mse_ratio']:.3f}" in out and "no motion" in out and "chance" in out
+
+
+def test_every_layer_of_the_shipped_checkpoint_is_alive():
+    run, data = training.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")
+    batch, sizes = training.make_batch(data, np.arange(40)), run.recipe.sizes
+    _, gradient = training.batch_gradient(run.vector, run.layout, sizes, batch, data.camera, training.WEIGHTS)
+    for name, part in training.unflatten(gradient, run.layout).items():
+        assert np.abs(part).max() > 1e-6, name
+    prediction, _ = training.run_forward_model(run.params, sizes, batch, data.camera)  # L_sim, Sec. III-E
+    state, following = (networks.state_embedding(networks.encode(run.params, points), valid) for points, valid
+                        in ((batch.points, batch.valid), (batch.next_points, batch.next_valid)))
+    assert np.abs(prediction.embedding - following).mean() < 0.9 * np.abs(state - following).mean()
 
 
 def test_the_same_seed_writes_the_same_checkpoint(tmp_path):

@@ -140,7 +140,7 @@ def test_the_next_embedding_is_the_present_one_and_a_change():
     valid[:, :9] = False
     params = random_parameters(rng)
     there = forward_model(params, SIZES, points, valid, pokes).embedding
-    params["next_2_w"], params["next_2_b"] = 0 * params["next_2_w"], 0 * params["next_2_b"]
+    params["next_w"], params["next_b"] = 0 * params["next_w"], 0 * params["next_b"]
     still = forward_model(params, SIZES, points, valid, pokes).embedding
     np.testing.assert_allclose(still, state_embedding(encode(params, points), valid))
     assert np.abs(there - still).max() > 1e-3

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from hind4sight_min import ops
 from hind4sight_min.ops import (dense, nearest_squared_distances, pool, softmax, squared_distances,
-                                take, take_block, total_variation, weighted_means)
+                                take, take_block, total_variation, weighted_maxima, weighted_means)
 
 CV2_MAJOR = int(cv2.__version__.split(".")[0])
 
@@ -433,6 +433,27 @@ def test_weighted_means_and_their_gradients_match_autograd_of_the_plain_formula(
     np.testing.assert_array_equal(weighted_means(x, 0 * weights), np.zeros((2, 3, 4)))  # under an empty mask
 
 
+def test_weighted_maxima_and_their_gradients_match_autograd_of_the_plain_formula():
+    rng = np.random.default_rng(24)
+    x, weights, g = rng.random((2, 7, 4)), rng.random((2, 7, 3)), rng.normal(size=(2, 3, 4))
+
+    def plain(x, weights):
+        return anp.max(weights[..., None] * x[:, :, None], axis=1)
+    np.testing.assert_array_equal(weighted_maxima(x, weights), plain(x, weights))
+    for argnum in (0, 1):
+        found = pulled_back(weighted_maxima, argnum, g, x, weights)
+        np.testing.assert_allclose(found, pulled_back(plain, argnum, g, x, weights), rtol=0, atol=1e-12)
+        assert np.count_nonzero(np.abs(found) > 1e-5) >= 12  # a point for every mask and channel, some for several
+    check_grads(weighted_maxima, (0, 1), modes=["rev"], order=1)(x, weights)
+    np.testing.assert_array_equal(weighted_maxima(x, 0 * weights), np.zeros((2, 3, 4)))  # under an empty mask
+
+
+def test_equal_weighted_maxima_all_have_the_gradient():
+    x, weights = np.array([[[2.0], [4.0], [1.0]]]), np.array([[[1.0], [0.5], [1.0]]])
+    np.testing.assert_array_equal(pulled_back(weighted_maxima, 0, 3.0, x, weights)[0, :, 0], [3, 1.5, 0])
+    np.testing.assert_array_equal(pulled_back(weighted_maxima, 1, 3.0, x, weights)[0, :, 0], [6, 12, 0])
+
+
 def test_softmax_and_its_gradient_match_scipy_and_finite_differences():
     rng = np.random.default_rng(15)
     logits, g = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 4))
@@ -507,6 +528,7 @@ def dtype_cases():
     yield pool, 0, (np.abs(x), np.array([[True, False, True, True, False]] * 2), pooling)
     for argnum in range(2):
         yield weighted_means, argnum, (x, rng.random((2, 5, 3)))
+        yield weighted_maxima, argnum, (np.abs(x), rng.random((2, 5, 3)))
     yield softmax, 0, (x,)
     yield total_variation, 0, (images, rng.random((2, 4, 4)), rng.random((2, 3, 5)))
 

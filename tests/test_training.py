@@ -246,17 +246,83 @@ def test_image_noise_lets_a_motion_begin():
     assert loss(1 / 256, noise) < loss(0, noise) - 1e-3
 
 
-def test_adam_against_its_formula():
+def test_vectors_follow_the_formula_of_adam():
     run = random_run()
     start, gradients = run.vector.astype(float), np.random.default_rng(1).standard_normal((2, len(run.vector)))
     for g in gradients:
-        training.adam_step(run, g.astype(np.float32), 0.01)
+        training.optimiser_step(run, g.astype(np.float32), 0.01)
     m1, v1 = 0.1 * gradients[0], 0.001 * gradients[0] ** 2
     expected = start - 0.01 * (m1 / 0.1) / (np.sqrt(v1 / 0.001) + 1e-8)
     m2, v2 = 0.9 * m1 + 0.1 * gradients[1], 0.999 * v1 + 0.001 * gradients[1] ** 2
     expected -= 0.01 * (m2 / (1 - 0.9 ** 2)) / (np.sqrt(v2 / (1 - 0.999 ** 2)) + 1e-8)
-    np.testing.assert_allclose(run.vector, expected, atol=1e-5)
-    assert np.abs(run.vector - start).min() > 1e-8
+    expected, start = unflatten(expected, run.layout), unflatten(start, run.layout)
+    vectors = [name for name, shape in run.layout.items() if len(shape) == 1]
+    assert len(vectors) > 10
+    for name in vectors:
+        np.testing.assert_allclose(run.params[name], expected[name], atol=1e-5)
+        assert np.abs(run.params[name] - start[name]).min() > 1e-8
+
+
+def polar_step(momentum):
+    """sqrt(max(shape)) U V^T by SVD, and how far five Newton-Schulz iterations move the singular values from 1."""
+    u, s, vt = np.linalg.svd(momentum, full_matrices=False)
+    s = s / np.linalg.norm(momentum)
+    for _ in range(5):
+        s = 3.4445 * s - 4.7750 * s ** 3 + 2.0315 * s ** 5
+    return np.sqrt(max(momentum.shape)) * (u * s) @ vt, s
+
+
+def test_matrices_follow_the_polar_factor_of_their_momentum():
+    run = random_run()
+    gradients = [unflatten(g, run.layout) for g in np.random.default_rng(2).standard_normal((2, len(run.vector)))]
+    middle = None
+    for g in gradients:
+        start, middle = middle, run.params
+        training.optimiser_step(run, np.concatenate([block.ravel() for block in g.values()]).astype(np.float32), 0.01)
+    matrices = [name for name, shape in run.layout.items() if len(shape) == 2]
+    assert len(matrices) > 10
+    for name in matrices:
+        first, second = gradients[0][name], gradients[1][name]
+        for before, after, momentum in ((start, middle, first),  # the mean ahead by one step, as Nesterov has it
+                                        (middle, run.params, 0.9 * (0.9 * 0.1 * first + 0.1 * second) + 0.1 * second)):
+            step, singular = polar_step(momentum)
+            np.testing.assert_allclose(before[name] - after[name], 0.01 * step, atol=2e-5)
+            assert 0.6 < np.median(singular) < 1.25
+            assert np.sqrt(np.mean(step ** 2)) == pytest.approx(1, abs=0.35)
+
+
+def test_orthogonalised_keeps_singular_vectors_and_evens_out_their_values():
+    rng = np.random.default_rng(3)
+    u, v = (np.linalg.qr(rng.standard_normal((size, 5)))[0] for size in (9, 7))
+    wanted = u @ v.T
+    for matrix, expected in (((u * [10, 5, 3, 2, 1]) @ v.T, wanted), ((v * [10, 5, 3, 2, 1]) @ u.T, wanted.T)):
+        for scale in (1e-6, 1.0, 1e6):
+            found = training.orthogonalised(np.float32(scale) * matrix.astype(np.float32))
+            assert found.dtype == np.float32 and found.shape == matrix.shape
+            np.testing.assert_allclose(np.linalg.svd(found)[1][:5], 1, atol=0.35)
+            assert np.sum(found * expected) / np.linalg.norm(found) / np.linalg.norm(expected) > 0.97
+    for least in (0, 1e-30):  # of a layer that a loss does not reach, or not any more; squares of 1e-30 are 0
+        assert np.abs(training.orthogonalised(np.full((4, 3), least, np.float32))).max() < 1e-10
+
+
+def test_the_step_of_a_matrix_is_that_of_torch_s_muon():
+    torch = pytest.importorskip("torch")
+    if not hasattr(torch.optim, "Muon"):
+        pytest.skip("this torch has no Muon")
+    run = random_run()
+    name = "motion_2_w"
+    weight = torch.nn.Parameter(torch.from_numpy(run.params[name].copy()))
+    muon = torch.optim.Muon([weight], lr=0.01, momentum=0.9, nesterov=True, weight_decay=0,
+                            adjust_lr_fn="match_rms_adamw")  # 0.2 of ours
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        gradient = rng.standard_normal(len(run.vector)).astype(np.float32)
+        before, ours = weight.detach().numpy().copy(), run.params[name]
+        weight.grad = torch.from_numpy(unflatten(gradient, run.layout)[name].copy())
+        muon.step()
+        training.optimiser_step(run, gradient, 0.01)
+        theirs, ours = (weight.detach().numpy() - before) / 0.2, run.params[name] - ours
+        assert np.linalg.norm(ours - theirs) < 0.05 * np.linalg.norm(ours)  # it iterates in bfloat16
 
 
 def test_every_epoch_shows_every_row_once():

@@ -44,7 +44,7 @@ PLANTED = {
     "07_networks": ("networks", "init_parameters",  # motions that do not start as the identity
                     lambda right: lambda *args: {name: value + np.float32(0.1 * (name == "motion_3_b"))
                                                  for name, value in right(*args).items()}),
-    "08_training": ("training", "adam_step",  # uphill
+    "08_training": ("training", "optimiser_step",  # uphill
                     lambda right: lambda run, gradient, rate: right(run, -gradient, rate)),
     "09_evaluation": ("evaluation", "poke_errors",  # directions that do not go round
                       lambda right: lambda pokes, true_pokes: (right(pokes, true_pokes)[0],
