@@ -21,7 +21,7 @@ from .networks import (Sizes, encode, forward_model, init_parameters, inverse_mo
                        windows)
 from .ops import take_block
 
-FORMAT = "hind4sight_min checkpoint 1"
+FORMAT = "hind4sight_min checkpoint 2"
 
 
 @dataclass
@@ -291,10 +291,10 @@ def orthogonalised(matrix):
 def optimiser_step(run, gradient, rate, beta1=0.9, beta2=0.999, epsilon=1e-8):
     """One step on the run's vector: Adam (Kingma and Ba) for vectors, orthogonalised momentum (Muon) for matrices.
 
-    The paper has Adam alone, Sec. III-G, and we had. The gradient of a layer's matrix is dominated by a few directions,
-    and the many others, in which the same pokes would also have it move, hardly move at all. Orthogonalising the
-    momentum gives all of them the same say. It takes a third of the steps (docs/research-log.md). Times
-    sqrt(max(shape)), an entry moves by the rate, in the root mean square, as in Adam's first step.
+    The paper has Adam for both, Sec. III-G. A few directions dominate the gradient of a layer's matrix; the others, in
+    which it would have to move as well, hardly get to. Orthogonalised, all have the same say, and a third of the steps
+    do (docs/research-log.md). Times sqrt(max(shape)), an entry moves by the rate, in the root mean square, as in Adam's
+    first step.
     """
     run.step += 1
     run.first_moment += (1 - beta1) * (gradient - run.first_moment)
