@@ -1,5 +1,11 @@
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,6 +145,34 @@ def test_the_same_seed_gives_the_same_run_on_any_number_of_processes():
     np.testing.assert_array_equal(together.vector, alone.vector)
     assert together.log == alone.log
     assert not np.array_equal(train(data, start_run(replace(recipe, seed=4), data)).vector, alone.vector)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_workers_end_with_their_parent_even_when_it_is_killed(tmp_path):
+    (tmp_path / "script.py").write_text("""
+import os, time
+from hind4sight_min import worker_pool
+if __name__ == "__main__":
+    with worker_pool(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 600).result()
+""")
+    with subprocess.Popen([sys.executable, str(tmp_path / "script.py")], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                          text=True) as parent:
+        worker = int(parent.stdout.readline())
+        os.kill(worker, 0)  # it is there
+        parent.kill()
+    for _ in range(200):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        # an orphan in a container may have nobody to take note of its end
+        if Path(f"/proc/{worker}/stat").exists() and " Z " in Path(f"/proc/{worker}/stat").read_text():
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    pytest.fail("the worker went on alone")
 
 
 def test_the_gradient_of_a_batch_is_that_of_its_chunks(monkeypatch):
