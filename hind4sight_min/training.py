@@ -354,8 +354,9 @@ def workers(jobs):
 
 
 def training_step(interactions, run, gradients, truth=None):
-    """One step of the optimiser on the run's next batch; `gradients` comes from `workers`. Adds the batch's terms to run.sums.
+    """One step of the optimiser on the run's next batch; `gradients` comes from `workers`.
 
+    Adds the batch's terms to run.sums.
     Raises FloatingPointError if the gradient is not finite; the run is then as it was.
     """
     recipe = run.recipe

@@ -157,8 +157,8 @@ if __name__ == "__main__":
         print(pool.submit(os.getpid).result(), flush=True)
         pool.submit(time.sleep, 600).result()
 """)
-    with subprocess.Popen([sys.executable, str(tmp_path / "script.py")], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                          text=True) as parent:
+    with subprocess.Popen([sys.executable, str(tmp_path / "script.py")], text=True, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL) as parent:
         worker = int(parent.stdout.readline())
         os.kill(worker, 0)  # it is there
         parent.kill()
