@@ -275,7 +275,7 @@ def click(image):
 
 
 DEMO_POKES, DEMO_TEST_POKES = 2000, 200
-DEMO_RECIPE = training.Recipe(steps=1000)
+DEMO_RECIPE = training.Recipe(steps=1000, learning_rate=2e-3)
 
 
 def run_demo(args):

@@ -65,11 +65,12 @@ def test_every_layer_of_the_shipped_checkpoint_is_alive():
     batch, sizes = training.make_batch(data, np.arange(40)), run.recipe.sizes
     _, gradient = training.batch_gradient(run.vector, run.layout, sizes, batch, data.camera, training.WEIGHTS)
     for name, part in training.unflatten(gradient, run.layout).items():
-        assert np.abs(part).max() > 1e-6, name
+        if name != "heatmaps_b":  # the same for all cells: softmax does not see it
+            assert np.abs(part).max() > 1e-6, name
     prediction, _ = training.run_forward_model(run.params, sizes, batch, data.camera)  # L_sim, Sec. III-E
     state, following = (networks.state_embedding(networks.encode(run.params, points), valid) for points, valid
                         in ((batch.points, batch.valid), (batch.next_points, batch.next_valid)))
-    assert np.abs(prediction.embedding - following).mean() < 0.9 * np.abs(state - following).mean()
+    assert np.sum((prediction.embedding - following) ** 2) < 0.9 * np.sum((state - following) ** 2)
 
 
 def test_the_same_seed_writes_the_same_checkpoint(tmp_path):

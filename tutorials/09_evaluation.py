@@ -189,7 +189,7 @@ small = {}
 for model, seeds in (("2d", (0,)), ("3d", (0,)), ("full", SEEDS)):
     for seed in seeds:
         recipe = reproduce.recipe_of(reproduce.Cell(model, NOISE, seed), reproduce.Scale(steps=STEPS))
-        recipe = replace(recipe, batch=4, warmup=20)  # little time
+        recipe = replace(recipe, batch=4, warmup=20, learning_rate=2e-3)  # little time
         trained = training.train(train, training.start_run(recipe, train))
         small[model, seed] = evaluation.evaluate(trained, data, truth, depth_noise=reproduce.NOISES[NOISE])
         found = small[model, seed]
