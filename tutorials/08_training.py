@@ -8,10 +8,10 @@ Equations:
 - Sec. III-G, the optimiser, batches, epochs: `training.optimiser_step`, `training.rows_of_step`, `training.learning_rate`, `training.train`; tests/test_training.py
 - Sec. IV-C, the error on held-out pokes: `evaluation.evaluate`; tests/test_evaluation.py
 
-Time: 30 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
+Time: 35 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
 
 Last lines to expect:
-   held-out: IoU of the masks: expected above 0.4, got 0.635
+   held-out: IoU of the masks: expected above 0.4, got 0.585
 08_training: all checks passed
 """
 # %% [markdown]
