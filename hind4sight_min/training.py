@@ -275,6 +275,7 @@ def start_run(recipe, interactions):
 
 def orthogonalised(matrix):
     """The matrix with all its singular values brought to about 1 (0.7 to 1.2), its singular vectors kept.
+    (I, O) -> (I, O).
 
     Five Newton-Schulz iterations with the coefficients of Muon (K. Jordan et al., 2024): every singular value s becomes
     3.4445 s - 4.7750 s^3 + 2.0315 s^5, which lifts the small ones quickest. An SVD, U V^T, takes four times as long.
@@ -303,7 +304,7 @@ def optimiser_step(run, gradient, rate, beta1=0.9, beta2=0.999, epsilon=1e-8):
     second = run.second_moment / (1 - beta2 ** run.step)
     step = first / (onp.sqrt(second) + onp.float32(epsilon))
     ahead = unflatten(beta1 * run.first_moment + (1 - beta1) * gradient, run.layout)  # Nesterov's momentum
-    for name, block in unflatten(step, run.layout).items():
+    for name, block in unflatten(step, run.layout).items():  # views of `step`
         if block.ndim == 2:
             block[:] = math.sqrt(max(block.shape)) * orthogonalised(ahead[name])
     run.vector = run.vector - onp.float32(rate) * step
