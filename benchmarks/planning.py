@@ -34,7 +34,7 @@ def main():
     with control.random_task(0, 2) as task:
         camera, settings = task.arena.camera, asdict(task.arena.settings)
         _, view, goal = control.first_look(task)
-    step = planning.learned_step(run, camera, view.valid)
+    step = planning.learned_step(run, camera, view)
     seconds, shares = [], []
     for seed in range(args.rounds):
         inside.clear()

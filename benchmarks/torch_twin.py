@@ -53,11 +53,22 @@ def poke_axes(pokes):
     return axes, torch.stack([pokes[:, 0], pokes[:, 1], zero], dim=-1)
 
 
-def pooling_weights(local, valid):
+def contact(local, valid):
+    x, y, z = local.unbind(-1)
+    central = (1 - (y / networks.REACH) ** 2).clamp(min=0).sqrt()
+    depth = networks.REACH * central - x
+    met = valid & (z > 0.005) & (central > 0) & (x > -0.16) & (depth > 0)
+    depth = depth * met
+    deepest = depth.amax(dim=1, keepdim=True)
+    features = torch.stack([depth / 0.05, central, (deepest - depth) / 0.05], dim=2)
+    return features, met * central * torch.exp((depth - deepest) / 0.004)
+
+
+def pooling_weights(local, valid, first):
     x, y, z = local.unbind(-1)
     near = torch.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
     path = torch.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
-    weights = torch.stack([near, path], dim=1) * (valid & (z > 0.005))[:, None]
+    weights = torch.stack([near, path, first], dim=1) * (valid & (z > 0.005))[:, None]
     return weights / (weights.sum(dim=2, keepdim=True) + 1e-6)
 
 
@@ -70,8 +81,8 @@ def encode(p, points):
     return torch.relu(linear(p, "encoder_2", x))
 
 
-def state_embedding(features, valid):
-    return (features * valid[..., None]).sum(dim=1) / valid.sum(dim=1, keepdim=True).clamp(min=1)
+def state_embedding(p, points, standing):
+    return networks.STATE_GAIN * (encode(p, points) * standing[..., None]).sum(dim=1)
 
 
 def so3_exp(w):
@@ -87,18 +98,17 @@ def so3_exp(w):
 
 
 def forward_model(p, sizes, points, valid, pokes):
-    """-> predicted points, masks, next embedding; networks.forward_model."""
-    features = encode(p, points)
-    state = state_embedding(features, valid)
+    """-> predicted points; networks.forward_model."""
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
-    pooling = pooling_weights(local, valid)
+    met, first = contact(local, valid)
+    pooling = pooling_weights(local, valid, first)
     shape = torch.relu(linear(p, "shape_2", torch.relu(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
         return torch.cat([(h * valid[..., None]).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
 
-    h = torch.relu(linear(p, "trunk_0", torch.cat([poke_features(local), features], dim=2)))
+    h = torch.relu(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):
         h = h + torch.relu(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
     seen = context(h)
@@ -109,7 +119,10 @@ def forward_model(p, sizes, points, valid, pokes):
     share = (moving / (moving.sum(dim=1, keepdim=True) + 1e-3)).transpose(1, 2)
     pooled, centroids = share @ h, share @ local
     tops = torch.stack([(h * moving[..., k:k + 1]).amax(dim=1) for k in range(moving.shape[2])], dim=1)
-    x = torch.cat([pooled, tops, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1], dim=2)
+    x, y = (local[..., :2] / 0.05).unbind(-1)
+    cx, cy = (centroids[..., :2] / 0.05).unbind(-1)
+    spread = share @ torch.stack([x * x, x * y, y * y], dim=2) - torch.stack([cx * cx, cx * cy, cy * cy], dim=2)
+    x = torch.cat([pooled, tops, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1, spread], dim=2)
     x = torch.relu(linear(p, "motion_2", torch.relu(linear(p, "motion_1", x))))
     twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", x)
     turn = so3_exp(twist[..., 3:])
@@ -120,10 +133,7 @@ def forward_model(p, sizes, points, valid, pokes):
     motions = torch.cat([rotations.flatten(2), translations], dim=2)
     still = F.pad(torch.eye(3, dtype=points.dtype).flatten(), (0, 3)).expand(len(points), 1, 12)
     blended = masks @ torch.cat([still, motions], dim=1)
-    predicted = (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:]
-
-    change = linear(p, "next", torch.cat([state, seen], dim=1))
-    return predicted, masks, state + change / networks.CHANGE_GAIN
+    return (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:]
 
 
 def inverse_model(p, before, after, weights, cells):
@@ -200,8 +210,11 @@ def photometric(images, next_images, flow, valid):
 
 def loss_terms(p, sizes, b, camera, nearest):
     """Batch means of all terms of Eq. (6); training.loss_terms."""
-    predicted, _, embedding = forward_model(p, sizes, b["points"], b["valid"], b["pokes"])
-    next_embedding = state_embedding(encode(p, b["next_points"]), b["next_valid"])
+    look, next_look = ((torch.arange(len(rows))[:, None], rows) for rows in (b["look"], b["next_look"]))
+    found = forward_model(p, sizes, b["points"][look], b["valid"][look], b["pokes"])
+    predicted = b["points"].index_put(look, found)
+    embedding = state_embedding(p, found, b["occupied"][look])
+    next_embedding = state_embedding(p, b["next_points"][next_look], b["next_occupied"][next_look])
     start, end = inverse_model(p, b["before"], b["after"], b["change"], b["cells"])
     images, next_images = b["images"], b["next_images"]
     flow = (project(predicted, camera) - project(b["points"], camera)).view(*images.shape[:3], 2)

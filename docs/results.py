@@ -2,13 +2,17 @@
 
     python docs/results.py record shipped -- hind4sight evaluate
     python docs/results.py ship runs/shipped.npz
+    python docs/results.py keep runs/reproduce
+    python docs/results.py restore runs/reproduce
     python docs/results.py summary
 
 `record NAME -- COMMAND` runs COMMAND with `--json` added and writes docs/results/NAME.json: the figures, the
 command, commit, versions, machine and duration. `ship CHECKPOINT` makes the checkpoint of the recorded result
-`training` the shipped one: without the optimiser's state, with its command and commit inside. `summary` gathers the
-headline figures of all recorded results in docs/results/summary.json and writes the README's table from them; a test
-fails while the README says anything else.
+`training` the shipped one: without the optimiser's state, with its command and commit inside. The paper's tables take
+hours: `keep FOLDER` adds the cells that `hind4sight reproduce --out FOLDER` has finished to docs/results/cells.json,
+each with its recipe and commit, and `restore FOLDER` puts them back, so that another machine goes on. `summary` gathers
+the headline figures of all recorded results in docs/results/summary.json and writes the README's table from them; a
+test fails while the README says anything else.
 """
 import json
 import os
@@ -21,11 +25,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 from hind4sight_min import reproduce
-from hind4sight_min.interactions import write_text
+from hind4sight_min.interactions import write_json, write_text
 from hind4sight_min.training import load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"
+CELLS = RESULTS / "cells.json"
 BEGIN, END = "<!-- figures: written by docs/results.py from docs/results/summary.json -->", "<!-- /figures -->"
 TABLES_BEGIN = "<!-- tables: written by docs/results.py from docs/results/reproduce.json -->"
 TABLES_END = "<!-- /tables -->"
@@ -102,9 +107,7 @@ HEADLINES = {
 
 def record(name, command):
     """Run a command and write its figures and their provenance to docs/results/NAME.json."""
-    git = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=ROOT, capture_output=True,
-                         text=True, check=True)
-    start = time.perf_counter()
+    began_at, start = reproduce.commit(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "figures.json"
         subprocess.run([*command, "--json", str(path)], check=True)
@@ -115,7 +118,7 @@ def record(name, command):
             libraries[library] = version(library)
         except ModuleNotFoundError:
             libraries[library] = None
-    result = {"figures": figures, "command": " ".join(command), "commit": git.stdout.strip(),
+    result = {"figures": figures, "command": " ".join(command), "commit": began_at,
               "seconds": round(time.perf_counter() - start, 1), "date": time.strftime("%Y-%m-%d"),
               "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
               "python": platform.python_version(), "versions": libraries}
@@ -130,6 +133,23 @@ def ship(checkpoint, target=ROOT / "data_small" / "checkpoint.npz"):
     training = json.loads((RESULTS / "training.json").read_text())
     run.meta.update(command=training["command"], commit=training["commit"])
     save_run(target, run, resumable=False)
+
+
+def keep(folder, kept=CELLS):
+    """Add the finished cells of `hind4sight reproduce --out folder` to those that are kept -> how many there are."""
+    cells = json.loads(kept.read_text()) if kept.exists() else {}
+    cells.update((path.stem, json.loads(path.read_text())) for path in Path(folder).glob("cells/*.json"))
+    write_json(kept, cells)
+    return len(cells)
+
+
+def restore(folder, kept=CELLS):
+    """Put the kept cells where `hind4sight reproduce --out folder` looks for finished ones -> how many were missing."""
+    cells = {Path(folder) / "cells" / f"{name}.json": cell for name, cell in json.loads(kept.read_text()).items()}
+    missing = {path: cell for path, cell in cells.items() if not path.exists()}
+    for path, cell in missing.items():
+        write_json(path, cell)
+    return len(missing)
 
 
 def recorded(name):
@@ -199,6 +219,10 @@ def main(arguments):
         record(arguments[1], arguments[3:])
     elif arguments[:1] == ["ship"] and len(arguments) == 2:
         ship(arguments[1])
+    elif arguments[:1] == ["keep"] and len(arguments) == 2:
+        print(f"{keep(arguments[1])} cells are kept in {CELLS.relative_to(ROOT)}")
+    elif arguments[:1] == ["restore"] and len(arguments) == 2:
+        print(f"{restore(arguments[1])} finished cells put into {arguments[1]}")
     elif arguments == ["summary"]:
         summary = gather()
         write_text(RESULTS / "summary.json", json.dumps(summary, indent=2, sort_keys=True) + "\n")

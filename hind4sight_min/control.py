@@ -214,7 +214,7 @@ def next_poke(policy, task, view, labels, goal, run, search, rng, on_iteration=N
     if policy == "oracle":
         rollout = oracle_rollout(arena, view, np.concatenate([labels.ravel(), task.marked + 1]), settings)
     else:
-        learned = planning.learned_step(run, arena.camera, view.valid)
+        learned = planning.learned_step(run, arena.camera, view)
         rollout = partial(planning.roll, learned if policy == "learned" else planning.no_motion_step, view,
                           settings=settings)
     return planning.plan(rollout, view, goal, arena.camera, settings, search, rng, on_iteration)
@@ -252,7 +252,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
         poke = found.pokes[0]
         costs.append((found.now, found.cost))
         seconds.append(time.perf_counter() - began)
-        moved, masks = planning.predict(run, camera, view.valid, view.cloud[None], poke[None])
+        moved, masks = planning.predict(run, camera, view, view.cloud[None], poke[None])
         grid = planning.occupied_grid(view.cloud[None], view.occupied, settings)
         options = planning.possible_starts(poke[None], grid, settings)[0]
         start = next((start for start in options[np.isfinite(options[:, 0])] if arena.descent_is_free(*start)), None)

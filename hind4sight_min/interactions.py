@@ -106,6 +106,17 @@ def occupied_pixels(depth, empty_depth, threshold=OCCUPIED):
     return (depth > 0) & (empty_depth > 0) & (empty_depth - depth > threshold)
 
 
+def prominence(depth, empty_depth):
+    """How far the highest of each pixel and its eight neighbours stands out: (..., H, W) m, 0 where there is no depth.
+
+    depth, empty_depth (..., H, W) m. What stands out is nearer than the empty arena. Not in the paper: with the
+    neighbours the rims of objects, and the table next to them, stand out as well.
+    """
+    rise = np.where((depth > 0) & (empty_depth > 0), empty_depth - depth, 0).astype(np.float32)
+    around = np.ones((3, 3), np.uint8)
+    return np.reshape([cv2.dilate(each, around) for each in rise.reshape(-1, *depth.shape[-2:])], depth.shape)
+
+
 def standing(depth, empty_depth, camera, settings, threshold=OCCUPIED):
     """The picture's points (..., H, W, 3) m, arena, and which of them are of something that stands inside the walls,
     (..., H, W) bool: `occupied_pixels`, less the walls.

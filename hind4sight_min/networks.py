@@ -6,13 +6,13 @@ once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
 
 The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. Box of Fig. 3 -> function here
 (its layers):
-    encoder, siamese             `encode` (encoder_*), one point at a time; `state_embedding`, its mean
+    encoder, siamese             `encode` (encoder_*), one point at a time; `state_embedding`, its sum
     poke                         `poke_frame`: not an input of its own but the frame that points are given in
     decoder of masks             `forward_model` (trunk_*, context_*, shape_*, mask)
     decoder of SE(3) motions     `_motions` (motion_*), from the features under each mask; the background's is fixed
-    next state embedding         `forward_model` (next)
+    next state embedding         `state_embedding` of the predicted cloud, by the same encoder
     inverse model, heat-maps     `inverse_model` (change_*, cell_*, heatmaps), from what `most_changed` finds
-Ours alone: `windows`, `height_map`, `pooling_weights`, `most_changed`, and all constants.
+Ours alone: `windows`, `standing_out`, `contact`, `height_map`, `pooling_weights`, `most_changed`, and all constants.
 """
 from dataclasses import dataclass
 
@@ -50,10 +50,9 @@ class Prediction:
     masks: object         # (B, N, K), summing to 1 over K
     rotations: object     # (B, K, 3, 3), in the poke's frame
     translations: object  # (B, K, 3) m, in the poke's frame
-    embedding: object     # (B, E): s'_{t+1}
 
 
-# --- inputs (fixed functions of the observation and the poke: nothing to differentiate) -----------------
+# --- inputs (fixed functions of the observation and the poke) --------------------------------------------
 
 def window_shape(camera):
     """(rows, columns) of the window the model looks at: half the picture high and half as wide."""
@@ -75,11 +74,24 @@ def windows(pokes, camera):
     return [(slice(t, t + rows), slice(c, c + columns)) for t, c in zip(top, left)]
 
 
+LOOK = 256  # points of a window that the forward model looks at: a third
+
+
+def standing_out(prominence):
+    """Which points of a window the forward model looks at, the LOOK most prominent: (B, N) m -> rows (B, M) int.
+
+    Not in the paper. By interactions.prominence they hold all but 0.03 % of the squared motion (0.1 % under 1 cm of
+    depth noise); the others are background that stays.
+    """
+    count = min(LOOK, prominence.shape[1])
+    return onp.sort(onp.argpartition(-prominence, count - 1, axis=1)[:, :count], axis=1)
+
+
 def fourier(values, wavelengths):
     """sin and cos of 2 pi v / w: positions as a perceptron can use them. (..., D) -> (..., 2 D len(wavelengths))."""
-    phase = values[..., None] * (2 * onp.pi / onp.asarray(wavelengths)).astype(values.dtype)
-    phase = phase.reshape(values.shape[:-1] + (-1,))
-    return onp.concatenate([onp.sin(phase), onp.cos(phase)], axis=-1)
+    phase = np.reshape(values, values.shape + (1,)) * (2 * onp.pi / onp.asarray(wavelengths)).astype(values.dtype)
+    phase = np.reshape(phase, values.shape[:-1] + (-1,))
+    return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
 
 
 def position_features(points, unit, wavelengths):
@@ -87,8 +99,8 @@ def position_features(points, unit, wavelengths):
 
     tanh(z / 1 cm) tells the table from what stands on it, by a threshold no perceptron would learn to be as sharp.
     """
-    return onp.concatenate([points / unit, onp.tanh(points[..., 2:] / 0.01), fourier(points[..., :2], wavelengths)],
-                           axis=-1)
+    across, up = take(points, (..., slice(0, 2))), take(points, (..., slice(2, 3)))
+    return np.concatenate([points / unit, np.tanh(up / 0.01), fourier(across, wavelengths)], axis=-1)
 
 
 def encoder_features(points):
@@ -133,15 +145,39 @@ def height_map(local, valid):
     return (total / (count + 0.2) / 0.03).reshape(len(local), -1)
 
 
-def pooling_weights(local, valid):
-    """Where the context looks: (B, 2, N), rows sum to 1. Around the target, and along the finger's path.
+REACH = 0.014  # m; half the width of what the finger sweeps: its radius and half a pixel
+
+
+def contact(local, valid):
+    """What the finger meets on its straight way to the target. Not in the paper: a perceptron learns it slowly.
+
+    A disc of radius `REACH` that ends in the origin pushes a point (x, y) of its way by d = sqrt(REACH^2 - y^2) - x;
+    the deepest one is met first. local (B, N, 3) m, poke frame; valid (B, N) bool
+    -> features of every point (B, N, 3): d in units of 5 cm (0 for what is not met), how central it lies in the way, in
+    [0, 1], and how much later than the first it is met; weights (B, N) in [0, 1], near 1 where the finger first meets
+    something, 0 where it meets nothing.
+    """
+    x, y, z = local[..., 0], local[..., 1], local[..., 2]
+    central = onp.sqrt(onp.maximum(0, 1 - (y / REACH) ** 2))  # 0 beside the way
+    depth = REACH * central - x
+    # The finger comes down at most 14 cm before the target.
+    met = valid & (z > 0.005) & (central > 0) & (x > -0.16) & (depth > 0)
+    depth = depth * met
+    deepest = depth.max(axis=1, keepdims=True)
+    features = onp.stack([depth / 0.05, central, (deepest - depth) / 0.05], axis=2)
+    return features.astype(local.dtype), (met * central * onp.exp((depth - deepest) / 0.004)).astype(local.dtype)
+
+
+def pooling_weights(local, valid, first):
+    """Where the context looks: (B, 3, N), rows sum to 1. Around the target, along the finger's path, and where it first
+    meets something; `first` (B, N) are the weights of `contact`.
 
     Points on the table's surface are left out: they say nothing about the objects there.
     """
     x, y, z = local[..., 0], local[..., 1], local[..., 2]
     near = onp.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
     path = onp.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
-    weights = onp.stack([near, path], axis=1) * (valid & (z > 0.005))[:, None]
+    weights = onp.stack([near, path, first], axis=1) * (valid & (z > 0.005))[:, None]
     return weights / (weights.sum(axis=2, keepdims=True) + 1e-6)
 
 
@@ -163,17 +199,16 @@ def init_parameters(sizes, rng, dtype=onp.float32):
     add("encoder_2", embedding, embedding)
     add("shape_1", len(MAP_X) * len(MAP_Y), head)
     add("shape_2", head, width)
-    add("trunk_0", 20 + embedding, width)
+    add("trunk_0", 23 + embedding, width)
     for i in range(1, sizes.rounds + 1):
         add(f"trunk_{i}", width, width)
-        add(f"context_{i}", 4 * width, width, gain=1.0)  # its bias is the trunk layer's
+        add(f"context_{i}", 5 * width, width, gain=1.0)  # its bias is the trunk layer's
         del params[f"trunk_{i}_b"]
     add("mask", width, sizes.masks - 1, gain=0.01)
     params["mask_b"] -= 1  # background first
-    add("motion_1", 6 * width + 3, head)
+    add("motion_1", 7 * width + 6, head)
     add("motion_2", head, head)
     add("motion_3", head, 6, gain=0.0)
-    add("next", embedding + 4 * width, embedding, gain=0.0)
     add("change_1", 2 * 20 + 2 * embedding + 1, inverse)
     add("change_2", inverse, inverse)
     add("cell_context_1", 4 * inverse, inverse)
@@ -198,33 +233,38 @@ def encode(params, points):
     return layer(params, "encoder_2", layer(params, "encoder_1", encoder_features(points)))
 
 
-def state_embedding(features, valid):
-    """s_t, the mean of the valid points' features. Paper: Sec. III-E.  (B, N, E), (B, N) bool -> (B, E)."""
-    mean = valid / onp.maximum(valid.sum(axis=1, keepdims=True), 1).astype(getval(features).dtype)
-    return np.reshape(np.matmul(mean[:, None], features), (len(mean), -1))
+STATE_GAIN = 3.0  # L_sim beside the cross entropies; of 1, 3, 10, 30, 100: see docs/research-log.md
+
+
+def state_embedding(params, points, standing):
+    """s_t, the sum of the encoder's features over the points of objects. Paper: Sec. III-E.
+
+    Of the predicted cloud it is the predicted s'_{t+1}, of the observed one s_{t+1}: an encoder that tells pokes apart
+    also tells how a prediction differs from what happened.  (B, N, 3) m arena, standing (B, N) bool -> (B, E).
+    """
+    features = encode(params, points)
+    weights = STATE_GAIN * standing[:, None].astype(getval(features).dtype)
+    return np.reshape(np.matmul(weights, features), (len(standing), -1))
 
 
 MASK_BOUND = 6.0  # a mover's logit stays within so much of the background's, which is 0
-
-# A poke changes some 3 % of the points, so s_{t+1} - s_t is small beside s_t.
-CHANGE_GAIN = 30.0
 
 
 def forward_model(params, sizes, points, valid, pokes):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
-    points (B, N, 3) m arena, those of a window; valid (B, N) bool; pokes (B, 3), (m, m, rad) -> Prediction.
+    points (B, N, 3) m arena, a set, those that `standing_out` found; valid (B, N) bool; pokes (B, 3), (m, m, rad)
+    -> Prediction.
     """
-    features = encode(params, points)
-    state = state_embedding(features, valid)
     local = poke_frame(points, pokes)
-    pooling = pooling_weights(local, valid)
+    met, first = contact(local, valid)
+    pooling = pooling_weights(local, valid, first)
     shape = layer(params, "shape_2", layer(params, "shape_1", height_map(local, valid)))  # (B, C)
 
-    def context(h):  # (B, N, C) -> (B, 4 C)
+    def context(h):  # (B, N, C) -> (B, 5 C)
         return np.concatenate([pool(h, valid, pooling), shape], axis=1)
 
-    h = layer(params, "trunk_0", np.concatenate([poke_features(local), features], axis=2))
+    h = layer(params, "trunk_0", np.concatenate([poke_features(local), met, encode(params, points)], axis=2))
     for i in range(1, sizes.rounds + 1):
         bias = layer(params, f"context_{i}", context(h), relu=False)
         h = dense(h, params[f"trunk_{i}_w"], bias, relu=True, residual=True)
@@ -239,10 +279,7 @@ def forward_model(params, sizes, points, valid, pokes):
     moved = transform_layer(local, masks, rotations, translations)  # Eq. (1)
     axes, _ = poke_axes(pokes.astype(points.dtype))
     predicted = points + np.matmul(moved - local, onp.swapaxes(axes, 1, 2))
-
-    change = layer(params, "next", np.concatenate([state, seen], axis=1), relu=False)
-    embedding = state + change / CHANGE_GAIN
-    return Prediction(predicted, masks, rotations, translations, embedding)
+    return Prediction(predicted, masks, rotations, translations)
 
 
 # Of [translation, rotation], in m and rad. The optimiser moves every weight by the learning rate, however small its
@@ -252,7 +289,8 @@ MOTION_UNIT = onp.array([0.005] * 3 + [0.1] * 3, onp.float32)
 
 
 def _motions(params, h, masks, seen, local, valid):
-    """One rigid motion per mask, from the features pooled under it; the background's is the identity.
+    """One rigid motion per mask, from the features pooled under it and its points' second moments; the background's is
+    the identity.
 
     The network speaks of a turn about the mask's centroid c and a shift t: p' = R (p - c) + c + t, that is
     T = c - R c + t, all in the poke frame.
@@ -260,9 +298,10 @@ def _motions(params, h, masks, seen, local, valid):
     moving = take(masks, (..., slice(1, None))) * valid[..., None]
     pooled, centroids = weighted_means(h, moving), weighted_means(local, moving)  # (B, K-1, C), (B, K-1, 3)
     tops = weighted_maxima(h, moving)  # (B, K-1, C): a mean does not see the one corner that the finger meets
+    moments = weighted_means(_products(local / 0.05), moving) - _products(centroids / 0.05)  # (B, K-1, 3)
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
-    x = layer(params, "motion_1", np.concatenate([pooled, tops, everywhere, centroids / 0.1], axis=2))
+    x = layer(params, "motion_1", np.concatenate([pooled, tops, everywhere, centroids / 0.1, moments], axis=2))
     twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), relu=False)  # (B, K-1, 6)
     turn = so3_exp(take(twist, (..., slice(3, None))))
     turned = np.matmul(turn, centroids[..., None])[..., 0]
@@ -270,6 +309,12 @@ def _motions(params, h, masks, seen, local, valid):
     identity = onp.broadcast_to(onp.eye(3, dtype=local.dtype), (batch, 1, 3, 3))
     return (np.concatenate([identity, turn], axis=1),
             np.concatenate([onp.zeros((batch, 1, 3), local.dtype), shift], axis=1))
+
+
+def _products(positions):
+    """x^2, xy and y^2 of positions (..., 3) -> (..., 3)."""
+    x, y = take(positions, (..., 0)), take(positions, (..., 1))
+    return np.stack([x * x, x * y, y * y], axis=-1)
 
 
 CHANGED_POINTS = 128  # the inverse model looks at those that changed most: a poke changes about a hundred

@@ -213,6 +213,17 @@ defvjp(take, _take_vjp, None)
 
 
 @primitive
+def put_rows(clouds, rows, values):
+    """The clouds (B, N, D) with their points `rows` (B, M) int, of which none repeats, replaced by values (B, M, D)."""
+    result = clouds.copy()
+    result[np.arange(len(rows))[:, None], rows] = values
+    return result
+
+
+defvjp(put_rows, None, None, lambda ans, clouds, rows, values: lambda g: g[np.arange(len(rows))[:, None], rows])
+
+
+@primitive
 def take_block(vector, start, shape):
     """vector[start:start + size] as an array of `shape`: one parameter of many."""
     return vector[start:start + math.prod(shape)].reshape(shape)

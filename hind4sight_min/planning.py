@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from . import check_whole
 from .geometry import project
-from .interactions import cell_centres, cells_of, grid_shape, standing
-from .networks import forward_model, window_shape, windows
+from .interactions import cell_centres, cells_of, grid_shape, prominence, standing
+from .networks import forward_model, standing_out, window_shape, windows
 
 CHUNK = 16  # candidates per call of the network: more of them leave the processor's cache
 
@@ -22,11 +22,13 @@ CHUNK = 16  # candidates per call of the network: more of them leave the process
 @dataclass(frozen=True)
 class View:
     """What the robot sees, ready for planning. cloud (N + M, 3) float32 m, arena; valid (N + M,) bool: has depth;
-    occupied (N + M,) bool: stands in the arena; marked: M, how many points at the end are the user's.
+    occupied (N + M,) bool: stands in the arena; prominence (N + M,) m: of interactions.prominence, infinite for marks;
+    marked: M, how many points at the end are the user's.
     """
     cloud: np.ndarray
     valid: np.ndarray
     occupied: np.ndarray
+    prominence: np.ndarray
     marked: int
 
 
@@ -97,7 +99,9 @@ def view_of(depth, empty_depth, camera, settings, marks):
         raise NoPoke("scene: no object stands in the arena")
     on = np.ones(len(marks), bool)
     return View(np.concatenate([points.reshape(-1, 3), marks]).astype(np.float32),
-                np.concatenate([depth.ravel() > 0, on]), np.concatenate([objects.ravel(), on]), len(marks))
+                np.concatenate([depth.ravel() > 0, on]), np.concatenate([objects.ravel(), on]),
+                np.concatenate([prominence(depth, empty_depth).ravel(), np.full(len(marks), np.inf, np.float32)]),
+                len(marks))
 
 
 def places_at(pixels, heights, camera, settings):
@@ -216,33 +220,32 @@ def roll(step, view, sequences, settings):
     return np.stack(after, axis=1), np.stack(starts, axis=1)
 
 
-def predict(run, camera, valid, clouds, pokes):
-    """The learned model on clouds (J, N + M, 3) m; valid (N + M,) bool, pokes (J, 3)
+def predict(run, camera, view, clouds, pokes):
+    """The learned model on clouds (J, N + M, 3) m, where the points of a view went; pokes (J, 3)
     -> clouds after the pokes, and the number of every point's largest mask, (J, N + M) int, 0 = background.
 
-    The model was trained on windows of the picture. Of a cloud that has moved it is given as many points, those whose
-    pixels lie in the window or nearest to it; the others stay.
+    Of each cloud it looks at the most prominent points whose pixels now lie in the window, as in training; all others
+    stay.
     """
-    rows, columns = window_shape(camera)
-    count, half = rows * columns, np.array([columns, rows], np.float32) / 2
+    half = np.array(window_shape(camera)[::-1], np.float32) / 2
     moved, masks = clouds.copy(), np.zeros(clouds.shape[:2], int)
     for first in range(0, len(clouds), CHUNK):
         part = slice(first, first + CHUNK)
         middle = np.array([[(c.start + c.stop - 1) / 2, (r.start + r.stop - 1) / 2]
                            for r, c in windows(pokes[part], camera)], np.float32)
         away = np.abs((project(clouds[part], camera) - middle[:, None]) / half).max(axis=2)  # 1: the window's rim
-        near = np.argpartition(away, count - 1, axis=1)[:, :count]
-        pick = (np.arange(len(near))[:, None], near)
-        found = forward_model(run.params, run.recipe.sizes, clouds[part][pick], valid[near],
+        look = standing_out(np.where(away <= 1, np.maximum(view.prominence, 0), -away))
+        pick = (np.arange(len(look))[:, None], look)
+        found = forward_model(run.params, run.recipe.sizes, clouds[part][pick], view.valid[look],
                               pokes[part].astype(np.float32))
         moved[part][pick] = found.points
         masks[part][pick] = found.masks.argmax(axis=2)
     return moved, masks
 
 
-def learned_step(run, camera, valid):
+def learned_step(run, camera, view):
     """The learned model as a `step` of `roll`."""
-    return lambda clouds, pokes: predict(run, camera, valid, clouds, pokes)[0]
+    return lambda clouds, pokes: predict(run, camera, view, clouds, pokes)[0]
 
 
 def no_motion_step(clouds, pokes):

@@ -4,6 +4,7 @@ Paper: Sec. IV, Tables I to III. Every cell of a table is a training run with a 
 finished cell leaves its figures in a file and is never run again. This file reads the simulator's truth.
 """
 import json
+import subprocess
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
@@ -114,15 +115,28 @@ def _data(folder):
 
 # --- one cell ----------------------------------------------------------------------------------------------------
 
+@lru_cache
+def commit():
+    """The commit that the package is of, with "-dirty" where files differ from it; None outside a checkout."""
+    found = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=Path(__file__).parent,
+                           capture_output=True, text=True)
+    return found.stdout.strip() if found.returncode == 0 else None
+
+
 def run_cell(cell, out, scale, save_every=60.0):
-    """Train and evaluate one cell, from where it was -> its metrics, with train_seconds. Runs in a worker process."""
+    """Train and evaluate one cell, from where it was -> its metrics, with train_seconds. Runs in a worker process.
+
+    What is finished is found in a file that says how it was made; `python docs/results.py keep` collects these files.
+    """
     path, figures = out / "cells" / f"{cell.name}.npz", out / "cells" / f"{cell.name}.json"
-    recipe = recipe_of(cell, scale)
+    recipe, began_at = recipe_of(cell, scale), commit()
+    made = {"recipe": plain(asdict(recipe)), "format": training.FORMAT, "test_pokes": scale.test_pokes,
+            "train_pokes": scale.train_pokes}
     if figures.exists():
-        metrics = json.loads(figures.read_text())
-        if metrics.pop("recipe", None) != plain(asdict(recipe)):
-            raise ValueError(f"{figures}: made with another recipe; remove it, or choose another --out")
-        return metrics
+        found = json.loads(figures.read_text())
+        if any(found.get(name) != value for name, value in made.items()):
+            raise ValueError(f"{figures}: made with another recipe or network; remove it, or choose another --out")
+        return found["metrics"]
     interactions, truth = _data(out / "train")
     run = training.load_run(path) if path.exists() else training.start_run(recipe, interactions)
     if run.recipe != recipe:
@@ -133,7 +147,7 @@ def run_cell(cell, out, scale, save_every=60.0):
     if cell.long and cell.noise == "clean":
         unseen = evaluation.evaluate(run, *_data(out / "unseen"))
         metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
-    write_json(figures, {**metrics, "recipe": asdict(recipe)})
+    write_json(figures, {**made, "commit": began_at, "metrics": metrics})
     return metrics
 
 

@@ -5,7 +5,7 @@ Only the supervised baseline, SE3-Nets (Recipe.association), is given the simula
 import math
 import time
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 
 import autograd.numpy as np
@@ -16,12 +16,12 @@ from autograd.tracer import getval
 from . import check_whole, losses, worker_pool
 from .geometry import Camera, free_radius, optical_flow, ray_spacing
 from .interactions import (add_depth_noise, associate_with_noise, cell_centres, cells_of, load_npz, occupied_pixels,
-                           points_and_validity, save_npz, smooth_depth, true_scene_flow)
-from .networks import (Sizes, encode, forward_model, init_parameters, inverse_model, most_changed, state_embedding,
-                       windows)
-from .ops import take_block
+                           points_and_validity, prominence, save_npz, smooth_depth, true_scene_flow)
+from .networks import (Sizes, forward_model, init_parameters, inverse_model, most_changed, standing_out,
+                       state_embedding, windows)
+from .ops import put_rows, take, take_block
 
-FORMAT = "hind4sight_min checkpoint 2"
+FORMAT = "hind4sight_min checkpoint 3"
 
 
 @dataclass
@@ -34,6 +34,10 @@ class Batch:
     next_points: onp.ndarray  # (B, n, 3), frame t+1
     valid: onp.ndarray        # (B, n) bool: has depth
     next_valid: onp.ndarray
+    occupied: onp.ndarray     # (B, n) bool: valid and nearer than the empty arena
+    next_occupied: onp.ndarray
+    look: onp.ndarray         # (B, M) int: the points that stand out, see networks.standing_out
+    next_look: onp.ndarray
     shared: onp.ndarray       # (B, n) bool: valid and seen in both frames, see losses.seen_in_both
     next_shared: onp.ndarray
     images: onp.ndarray       # (B, h, w, 3) float32 in [0, 1]
@@ -85,6 +89,7 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
     def cut(pictures):  # (2, B, H, W, ...) -> (2, B, h, w, ...)
         return onp.stack([pictures[(slice(None), i, *part)] for i, part in enumerate(parts)], axis=1)
 
+    look = (standing_out(each.reshape(len(rows), -1)) for each in cut(prominence(depth, empty[None])))
     targets = None
     if truth is not None:
         targets = associated_targets(interactions, rows, mirror, points[0], depth[0], truth, association, rng)
@@ -94,7 +99,7 @@ def make_batch(interactions, rows, mirror=False, depth_noise=0.0, rng=None, whol
         images[0] += onp.float32(image_noise) * rng.standard_normal(images[0].shape, onp.float32)
     points, valid, occupied = (value.reshape(2, len(rows), -1, *value.shape[4:])
                                for value in map(cut, (points, valid, occupied)))
-    return Batch(*points, *valid, *losses.seen_in_both(*valid, *occupied), *images, *changed, pokes,
+    return Batch(*points, *valid, *occupied, *look, *losses.seen_in_both(*valid, *occupied), *images, *changed, pokes,
                  cells_of(starts, settings), cells_of(pokes[:, :2], settings), cell_centres(settings), targets)
 
 
@@ -115,9 +120,24 @@ def associated_targets(interactions, rows, mirror, points, depth, truth, window,
     return targets
 
 
+def at_rows(rows):
+    """The key of the points `rows` (B, M) of clouds (B, N, D)."""
+    return onp.arange(len(rows))[:, None], rows
+
+
+def predict_clouds(params, sizes, batch):
+    """The forward model on the points that stand out; all others are background that stays -> Prediction of all n."""
+    look = at_rows(batch.look)
+    found = forward_model(params, sizes, batch.points[look], batch.valid[look], batch.pokes)
+    masks = onp.zeros(batch.valid.shape + (sizes.masks,), batch.points.dtype)
+    masks[..., 0] = 1
+    return replace(found, points=put_rows(batch.points, batch.look, found.points),
+                   masks=put_rows(masks, batch.look, found.masks))
+
+
 def run_forward_model(params, sizes, batch, camera):
     """What the poke does to a batch -> (Prediction, optical flow (B, h, w, 2) px). Paper: Fig. 3."""
-    prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
+    prediction = predict_clouds(params, sizes, batch)
     flow = optical_flow(batch.points, prediction.points, camera)  # the projection layer, Sec. III-C
     return prediction, np.reshape(flow, batch.images.shape[:3] + (2,))
 
@@ -132,7 +152,7 @@ def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
     ablation leaves out takes no time. For a batch with targets, the one term of SE3-Nets.
     """
     if batch.targets is not None:
-        prediction = forward_model(params, sizes, batch.points, batch.valid, batch.pokes)
+        prediction = predict_clouds(params, sizes, batch)
         return {"association": losses.association_loss(prediction.points, batch.targets, batch.valid)}
     prediction, flow = run_forward_model(params, sizes, batch, camera)
 
@@ -143,9 +163,10 @@ def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
                                     ray_spacing(batch.next_points, camera))
 
     def inverse():
-        heatmaps = run_inverse_model(params, batch)
-        next_embedding = state_embedding(encode(params, batch.next_points), batch.next_valid)
-        return losses.inverse_loss(*heatmaps, batch.start_cells, batch.end_cells, prediction.embedding, next_embedding)
+        look, next_look = at_rows(batch.look), at_rows(batch.next_look)
+        embeddings = (state_embedding(params, take(prediction.points, look), batch.occupied[look]),
+                      state_embedding(params, batch.next_points[next_look], batch.next_occupied[next_look]))
+        return losses.inverse_loss(*run_inverse_model(params, batch), batch.start_cells, batch.end_cells, *embeddings)
 
     terms = {
         "chamfer": lambda: losses.chamfer_loss(*maps()),

@@ -149,7 +149,8 @@ def test_the_other_planners(policy, run):
 def test_greedy_pokes_what_is_farthest_from_its_goal(farthest, shift):
     here = island().cloud
     there = here + np.float32([0.1, 0.1, 0])
-    view = View(np.vstack([here[:-1], there[:-1], here[-1:], there[-1:]]), np.ones(42, bool), np.ones(42, bool), 2)
+    cloud = np.vstack([here[:-1], there[:-1], here[-1:], there[-1:]])
+    view = View(cloud, np.ones(42, bool), np.ones(42, bool), np.full(42, 0.03), 2)
     goals = view.cloud[-2:] + np.float32([0.01, 0, 0])
     goals[farthest] = view.cloud[-2 + farthest] + np.float32(shift)
     poke = control.greedy_poke(view, Goal(project(goals, CAMERA), None), CAMERA, SETTINGS, np.random.default_rng(0))[0]

@@ -38,7 +38,7 @@ def oracle(monkeypatch, data, truth, share, drift=0.0):
         end, start = np.zeros((2, len(rows), 400))
         end[np.arange(len(rows)), batch.end_cells] = 1
         start[np.arange(len(rows)), batch.start_cells] = 1
-        return batch, Prediction(points, masks, None, None, None), flow, start, end
+        return batch, Prediction(points, masks, None, None), flow, start, end
     monkeypatch.setattr(evaluation, "predict", predict)
 
 

@@ -13,9 +13,9 @@ from scipy.stats import chisquare
 from hind4sight_min.geometry import Camera, look_at, unproject
 from hind4sight_min.interactions import (DEPTH_UNIT, FORMAT, Interactions, Truth, add_depth_noise, associate_with_noise,
                                          cell_centres, cells_of, grid_shape, load_interactions, load_npz, load_shard,
-                                         load_truth, occupied_pixels, points_and_validity, rotation_from_quaternion,
-                                         save_npz, save_shard, shards_in, smooth_depth, true_scene_flow, truth_path,
-                                         write_json)
+                                         load_truth, occupied_pixels, points_and_validity, prominence,
+                                         rotation_from_quaternion, save_npz, save_shard, shards_in, smooth_depth,
+                                         true_scene_flow, truth_path, write_json)
 
 WIDTH, HEIGHT = 8, 6
 SETTINGS = {"arena": 0.5, "cell": 0.025}
@@ -82,6 +82,19 @@ def test_occupied_pixels_are_nearer_than_the_empty_arena_and_have_depth():
     depth = np.array([[0.7, 0.693, 0.691, 0.75, 0.0, 0.6]], np.float32)
     assert occupied_pixels(depth, empty).tolist() == [[False, False, True, False, False, False]]
     assert occupied_pixels(depth, empty, threshold=0.005).tolist() == [[False, True, True, False, False, False]]
+
+
+def test_prominence_against_a_loop_over_neighbours():
+    rng = np.random.default_rng(31)
+    empty = rng.uniform(0.6, 0.7, (6, 8)).astype(np.float32)
+    depth = empty - rng.uniform(-0.01, 0.06, (2, 6, 8)).astype(np.float32)
+    depth[0, 2, 3] = depth[1, 0, 0] = 0  # no depth: stands out for nobody
+    found = prominence(depth, empty)
+    assert found.shape == depth.shape and found.dtype == np.float32
+    for b, v, u in np.ndindex(depth.shape):
+        around = [empty[y, x] - depth[b, y, x] if depth[b, y, x] else 0.0
+                  for y in range(max(v - 1, 0), min(v + 2, 6)) for x in range(max(u - 1, 0), min(u + 2, 8))]
+        assert found[b, v, u] == pytest.approx(max(around), abs=1e-6)
 
 
 def test_shard_round_trip(tmp_path):

@@ -5,9 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from hind4sight_min import networks
 from hind4sight_min.geometry import Camera, look_at, project
-from hind4sight_min.networks import (Sizes, encode, encoder_features, forward_model, fourier, height_map,
+from hind4sight_min.networks import (Sizes, contact, encode, encoder_features, forward_model, fourier, height_map,
                                      init_parameters, inverse_model, most_changed, poke_axes, poke_features,
-                                     poke_frame, pooling_weights, state_embedding, windows)
+                                     poke_frame, pooling_weights, standing_out, state_embedding, windows)
 from hind4sight_min.ops import weighted_means
 
 SIZES = Sizes(masks=3, width=8, head=10, rounds=2, embedding=6, inverse=9)
@@ -66,7 +66,7 @@ def test_forward_model_turns_with_the_arena_except_for_its_arena_features():
     rng = np.random.default_rng(3)
     points, valid, pokes = scene(rng)
     params = random_parameters(rng)
-    params["trunk_0_w"][20:] = 0  # what comes from the encoder is tied to the arena: switch it off
+    params["trunk_0_w"][23:] = 0  # what comes from the encoder is tied to the arena: switch it off
     before = forward_model(params, SIZES, points, valid, pokes)
     turn, _ = poke_axes(np.array([[0, 0, 0.7]]))
     turned_pokes = np.column_stack([pokes[:, :2] @ turn[0, :2, :2].T, pokes[:, 2] + 0.7])
@@ -84,7 +84,7 @@ def test_points_without_depth_do_not_change_the_others():
     points[:, :10] = rng.uniform(-1, 1, (2, 10, 3))
     second = forward_model(params, SIZES, points, valid, pokes)
     np.testing.assert_allclose(second.points[:, 10:], first.points[:, 10:], atol=1e-12)
-    np.testing.assert_allclose(second.embedding, first.embedding, atol=1e-12)
+    np.testing.assert_allclose(second.masks[:, 10:], first.masks[:, 10:], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", sorted(init_parameters(SIZES, np.random.default_rng(0))))
@@ -92,14 +92,15 @@ def test_gradient_of_every_parameter_against_finite_differences(name):
     rng = np.random.default_rng(5)
     points, valid, pokes = scene(rng)
     next_points = points + 0.02 * rng.standard_normal(points.shape)
-    params, cells = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2))
+    params, cells, standing = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2)), points[..., 2] > 0.02
     readout = [rng.standard_normal(shape) for shape in ((2, 40, 3), (2, 6), (2, 7), (2, 7))]
 
     def scalar(value):
         p = {**params, name: value}
         prediction = forward_model(p, SIZES, points, valid, pokes)
+        embedding = state_embedding(p, prediction.points, standing)
         start, end = inverse_model(p, *most_changed(points, next_points, valid), cells)
-        return sum((a * b).sum() for a, b in zip((prediction.points, prediction.embedding, start, end), readout))
+        return sum((a * b).sum() for a, b in zip((prediction.points, embedding, start, end), readout))
 
     direction = rng.standard_normal(params[name].shape)
     step = 1e-7  # small: with relu and max-pooling a longer step may cross a kink
@@ -125,25 +126,32 @@ def test_siamese_encoder_serves_both_models():
         assert np.abs(grad(model)(params["encoder_1_w"])).max() > 1e-6
 
 
-def test_state_embedding_is_the_mean_over_valid_points():
+def test_state_embedding_is_the_sum_over_what_stands():
     rng = np.random.default_rng(7)
-    features, valid = rng.standard_normal((2, 40, 6)), np.ones((2, 40), bool)
-    valid[0, :15] = False
-    embedding = state_embedding(features, valid)
-    np.testing.assert_allclose(embedding[0], features[0, 15:].mean(axis=0))
-    np.testing.assert_allclose(embedding[1], features[1].mean(axis=0))
+    points, _, _ = scene(rng)
+    params, standing = random_parameters(rng), rng.random((2, 40)) < 0.3
+    found = state_embedding(params, points, standing)
+    assert found.shape == (2, 6) and standing.any(axis=1).all()
+    for b in range(2):
+        expected = sum(encode(params, points[b, n]) for n in np.flatnonzero(standing[b]))
+        np.testing.assert_allclose(found[b], networks.STATE_GAIN * expected)
 
 
-def test_the_next_embedding_is_the_present_one_and_a_change():
-    rng = np.random.default_rng(0)
-    points, valid, pokes = scene(rng)
-    valid[:, :9] = False
-    params = random_parameters(rng)
-    there = forward_model(params, SIZES, points, valid, pokes).embedding
-    params["next_w"], params["next_b"] = 0 * params["next_w"], 0 * params["next_b"]
-    still = forward_model(params, SIZES, points, valid, pokes).embedding
-    np.testing.assert_allclose(still, state_embedding(encode(params, points), valid))
-    assert np.abs(there - still).max() > 1e-3
+def test_state_embedding_pulls_at_the_points_that_stand():
+    # What makes L_sim a loss of masks and motions: its gradient with respect to the predicted points.
+    rng = np.random.default_rng(8)
+    points, _, _ = scene(rng)
+    params, standing, readout = random_parameters(rng), points[..., 2] > 0.03, rng.standard_normal((2, 6))
+
+    def scalar(where):
+        return (state_embedding(params, where, standing) * readout).sum()
+    found, step = grad(scalar)(points), 1e-7
+    assert not found[~standing].any() and np.abs(found[standing]).min() > 0
+    for _ in range(3):
+        direction = rng.standard_normal(points.shape)
+        expected = (scalar(points + step * direction) - scalar(points - step * direction)) / (2 * step)
+        assert abs(expected) > 1
+        np.testing.assert_allclose((found * direction).sum(), expected, rtol=1e-5)
 
 
 def test_a_motion_turns_about_its_masks_centroid_and_then_shifts():
@@ -268,12 +276,45 @@ def test_height_map_against_a_loop_over_points():
     np.testing.assert_allclose(height_map(local, valid), (total / (count + 0.2) / 0.03).reshape(2, 140), atol=1e-12)
 
 
-def test_pooling_weights_look_at_the_target_and_along_the_path():
+def test_pooling_weights_look_at_the_target_along_the_path_and_at_the_first_contact():
     local = np.array([[[0, 0, 0.03], [-0.1, 0, 0.03], [0.1, 0.1, 0.03], [0, 0, 0.0]]])
-    near, path = pooling_weights(local, np.ones((1, 4), bool))[0]
+    valid = np.ones((1, 4), bool)
+    near, path, first = pooling_weights(local, valid, contact(local, valid)[1])[0]
     assert near[0] > 0.9 and near[3] == 0  # the last lies on the table
     np.testing.assert_allclose(path[:2], 0.5, atol=1e-3)
     assert path[2] == 0
+    np.testing.assert_allclose(first, [0, 1, 0, 0], atol=1e-5)  # the finger comes from negative x
+
+
+def test_contact_against_a_disc_that_pushes_points():
+    rng, step = np.random.default_rng(13), 2e-5
+    local = np.column_stack([rng.uniform(-0.15, 0.05, 60), rng.uniform(-0.02, 0.02, 60), rng.uniform(0, 0.05, 60)])
+    valid, x = rng.random(60) < 0.9, local[:, 0].copy()
+    standing = valid & (local[:, 2] > 0.005)
+    for centre in np.arange(-0.2, 0, step):  # what the disc reaches goes ahead of it
+        x[np.hypot(x - centre, local[:, 1]) < networks.REACH] += step
+    depth = (x - local[:, 0]) * standing
+    features, weights = (value[0] for value in contact(local[None], valid[None]))
+    assert (depth > 1e-3).sum() > 15 and (standing & (depth == 0)).sum() > 5
+    np.testing.assert_allclose(0.05 * features[:, 0], depth, atol=1e-4)
+    np.testing.assert_allclose(0.05 * features[:, 2], depth.max() - depth, atol=1e-4)
+    np.testing.assert_allclose(features[:, 1], np.sqrt(np.maximum(0, 1 - (local[:, 1] / networks.REACH) ** 2)))
+    assert weights.argmax() == (np.exp(depth / 0.004) * features[:, 1] * (depth > 0)).argmax()
+    assert (weights > 0).sum() == (depth > 1e-3).sum() and 0.2 < weights.max() <= 1
+
+
+def test_contact_is_blind_to_what_is_not_met():
+    local = np.array([[[-0.05, 0.03, 0.02], [0.03, 0, 0.02], [-0.05, 0, 0.001], [-0.2, 0, 0.02]]], np.float32)
+    features, weights = contact(local, np.ones((1, 4), bool))  # beside the way, beyond it, on the table, behind it
+    assert not features[..., 0].any() and not weights.any() and features.dtype == weights.dtype == np.float32
+
+
+def test_standing_out_takes_the_most_prominent_points(monkeypatch):
+    monkeypatch.setattr(networks, "LOOK", 7)
+    prominence = np.random.default_rng(14).standard_normal((3, 20)).astype(np.float32)
+    for rows, row in zip(standing_out(prominence), prominence):
+        np.testing.assert_array_equal(rows, np.sort(np.argsort(row)[-7:]))
+    np.testing.assert_array_equal(standing_out(prominence[:, :4]), np.tile(np.arange(4), (3, 1)))  # all there are
 
 
 @pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("head", 0), ("rounds", 0), ("embedding", 0),

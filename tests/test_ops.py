@@ -9,7 +9,7 @@ from autograd.test_util import check_grads
 from scipy.ndimage import map_coordinates
 
 from hind4sight_min import ops
-from hind4sight_min.ops import (dense, nearest_squared_distances, pool, softmax, squared_distances,
+from hind4sight_min.ops import (dense, nearest_squared_distances, pool, put_rows, softmax, squared_distances,
                                 take, take_block, total_variation, weighted_maxima, weighted_means)
 
 CV2_MAJOR = int(cv2.__version__.split(".")[0])
@@ -343,6 +343,19 @@ def test_take_block_and_its_gradient():
     np.testing.assert_array_equal(pulled_back(take_block, 0, g, vector, 4, (2, 3)), [0] * 4 + [*g.ravel()] + [0])
     twice = grad(lambda v: anp.sum(take_block(v, 4, (2, 3)) * g) + 2 * anp.sum(take_block(v, 8, (3,))))(vector)
     np.testing.assert_allclose(twice, np.r_[[0] * 4, g.ravel(), 0] + np.r_[[0] * 8, 2, 2, 2])
+
+
+def test_put_rows_and_its_gradient():
+    rng = np.random.default_rng(23)
+    clouds, values, g = (rng.normal(size=(2, count, 3)) for count in (5, 2, 5))
+    rows = np.array([[4, 1], [0, 3]])
+    found, kept = put_rows(clouds, rows, values), clouds.copy()
+    for b in range(2):
+        for n in range(5):
+            expected = values[b, list(rows[b]).index(n)] if n in rows[b] else clouds[b, n]
+            np.testing.assert_array_equal(found[b, n], expected)
+    np.testing.assert_array_equal(clouds, kept)  # a copy
+    check_grads(lambda v: put_rows(clouds, rows, v) * g, modes=["rev"])(values)
 
 
 @pytest.mark.parametrize("key", [

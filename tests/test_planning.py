@@ -33,7 +33,7 @@ def island(count=20, seed=0):
     """A View of one small object at (0, 0) with a mark on it, and nothing else."""
     points = np.random.default_rng(seed).uniform([-0.01, -0.01, 0.02], [0.01, 0.01, 0.03], (count, 3))
     cloud = np.float32(np.vstack([points, [[0, 0, 0.03]]]))
-    return View(cloud, np.ones(count + 1, bool), np.ones(count + 1, bool), 1)
+    return View(cloud, np.ones(count + 1, bool), np.ones(count + 1, bool), cloud[:, 2], 1)
 
 
 # --- CEM ------------------------------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere(pokes):
 def test_no_room_behind_any_object_is_said():
     x, y = np.meshgrid(np.arange(-0.24, 0.25, 0.02), np.arange(-0.24, 0.25, 0.02))
     cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]).astype(np.float32)
-    full = View(cloud, np.ones(len(cloud), bool), np.ones(len(cloud), bool), 0)
+    full = View(cloud, np.ones(len(cloud), bool), np.ones(len(cloud), bool), cloud[:, 2], 0)
     with pytest.raises(ValueError, match="no room for the finger"):
         planning.draw_pokes(np.random.default_rng(7), 10, full, SETTINGS)
 
@@ -219,13 +219,13 @@ def test_no_room_behind_any_object_is_said():
 # --- rollouts -------------------------------------------------------------------------------------------------
 
 def test_predict_is_the_model_that_was_evaluated(pokes, run):
-    # On the cloud of a picture the points given to the model are those of its window.
+    # On the cloud of a picture the points given to the model are the most prominent ones of its window.
     interactions, _ = pokes
     for row in (1, 5, 30):
         batch, prediction, *_ = evaluation.predict(run, interactions, np.array([row]))
         view = view_of_row(interactions, row)
         camera, poke = interactions.camera, interactions.pokes[[row]]
-        moved, masks = planning.predict(run, camera, view.valid, view.cloud[None], poke)
+        moved, masks = planning.predict(run, camera, view, view.cloud[None], poke)
         np.testing.assert_allclose(moved[0], prediction.points[0], atol=2e-4)
         assert np.abs(moved[0] - view.cloud).max() > 0.01
         assert np.mean(masks[0] == prediction.masks[0].argmax(axis=1)) > 0.999
@@ -271,7 +271,7 @@ def test_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects():
     view = island()
     table = np.float32([[0.2, 0.2, 0], [-0.2, 0.1, 0]])
     two = View(np.vstack([table, view.cloud, [[0.01, 0, 0.03]]]).astype(np.float32), np.ones(24, bool),
-               np.r_[False, False, np.ones(22, bool)], 2)
+               np.r_[False, False, np.ones(22, bool)], np.full(24, 0.03), 2)
     goal = Goal(project(two.cloud[-2:], CAMERA) + [[10, 0], [0, 4]], None)
     found = planning.planning_cost(two.cloud[None], two, goal, CAMERA, Search(chamfer_weight=0.0))
     assert found[0] == pytest.approx((10 + 4) / 2 - planning.SLACK, rel=1e-4)
@@ -352,7 +352,7 @@ def test_marks_are_followed_over_real_pokes(pokes, run):
         true = points + true_scene_flow(points, np.array(movers), truth.poses_before[row], truth.poses_after[row])
         view = planning.view_of(depth, empty, camera, SETTINGS, points)
         after = planning.view_of(interactions.depth_after[row], empty, camera, SETTINGS, points)
-        moved, masks = planning.predict(run, camera, view.valid, view.cloud[None], interactions.pokes[[row]])
+        moved, masks = planning.predict(run, camera, view, view.cloud[None], interactions.pokes[[row]])
         found = planning.follow(view, interactions.rgb_before[row], interactions.pokes[row], moved[0], masks[0], after,
                                 interactions.rgb_after[row])
         errors.extend(np.linalg.norm(found - true, axis=1))

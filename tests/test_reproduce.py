@@ -85,6 +85,8 @@ def test_the_figures_of_another_recipe_are_not_taken(tmp_path, small_world, monk
     cell = Cell("full", "clean", 1)
     found = reproduce.run_cell(cell, tmp_path, TINY_SCALE)
     assert reproduce.run_cell(cell, tmp_path, TINY_SCALE) == found
+    file = json.loads((tmp_path / "cells" / "full-clean-1.json").read_text())
+    assert file["metrics"] == found and file["commit"] == reproduce.commit()
     with pytest.raises(ValueError, match="full-clean-1.json: made with another recipe"):
         reproduce.run_cell(cell, tmp_path, replace(TINY_SCALE, steps=5))
 

@@ -3,11 +3,14 @@ import importlib
 import importlib.util
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from hind4sight_min.training import load_run, save_run
+from hind4sight_min import reproduce
+from hind4sight_min.interactions import write_json
+from hind4sight_min.training import FORMAT, load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -48,11 +51,35 @@ def test_readme_says_what_the_summary_says():
 
 def test_every_result_says_where_it_comes_from():
     for path in (ROOT / "docs" / "results").glob("*.json"):
-        if path.name != "summary.json":
+        if path.name not in ("summary.json", "cells.json"):
             record = json.loads(path.read_text())
             for key in ("figures", "command", "commit", "seconds", "date", "machine", "python", "versions"):
                 assert record[key], (path.name, key)
             assert "dirty" not in record["commit"], path.name
+
+
+def test_kept_cells_are_of_todays_recipes_and_network():
+    cells = {cell.name: cell for cell in reproduce.cells_of_tables(list(reproduce.TABLES), reproduce.FULL)}
+    for name, kept in json.loads(results.CELLS.read_text()).items():
+        assert kept["recipe"] == reproduce.plain(asdict(reproduce.recipe_of(cells[name], reproduce.FULL))), name
+        assert kept["format"] == FORMAT and kept["test_pokes"] == reproduce.FULL.test_pokes, name
+        assert kept["commit"] and "dirty" not in kept["commit"], name
+        assert kept["metrics"]["train_seconds"] > 0 and 0 < kept["metrics"]["flow_mse_ratio"] < 2, name
+
+
+def test_cells_are_kept_and_restored(tmp_path):
+    cells, kept = tmp_path / "runs" / "cells", tmp_path / "kept.json"
+    for name, ratio in (("a", 0.1), ("b", 0.2)):
+        write_json(cells / f"{name}.json", {"metrics": {"flow_mse_ratio": ratio}})
+    assert results.keep(tmp_path / "runs", kept) == 2
+    (cells / "a.json").unlink()
+    write_json(cells / "b.json", {"metrics": {"flow_mse_ratio": 0.3}})  # run again since: not touched
+    assert results.restore(tmp_path / "runs", kept) == 1
+    found = {path.stem: json.loads(path.read_text())["metrics"]["flow_mse_ratio"] for path in cells.iterdir()}
+    assert found == {"a": 0.1, "b": 0.3}
+    (cells / "a.json").unlink()
+    assert results.keep(tmp_path / "runs", kept) == 2  # what this machine lacks stays kept
+    assert json.loads(kept.read_text())["b"]["metrics"]["flow_mse_ratio"] == 0.3
 
 
 def test_readme_points_to_functions_and_files_that_exist():

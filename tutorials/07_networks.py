@@ -51,21 +51,28 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 #
 # applied to each point by itself (`networks.layer`). The *siamese encoder* (Sec. III-E) is two such layers on 20
 # fixed functions of a point's position, `networks.encoder_features`; siamese means that the clouds before and after
-# share its parameters. The mean of its features over all points with depth is the *state embedding* s_t.
+# share its parameters. The sum of its features over the points of objects is the *state embedding* s_t
+# (`networks.state_embedding`); that of the predicted cloud is to be like that of the cloud that was observed.
 #
 # What tells the points about each other is *context*: the maximum and weighted sums of a layer's features over the
 # whole cloud (`ops.pool`), handed back to every point. Neither a maximum nor a sum minds an order. So a shuffled
-# cloud must give the same answer, shuffled. We try this on the whole forward model, with a batch of one poke, cut
-# to the window around its target (`networks.windows`) that the model looks at:
+# cloud must give the same answer, shuffled. We try this on the whole forward model, with a batch of one poke.
+#
+# Most of a picture is table that stays. So the model looks at a window around the target (`networks.windows`), and
+# there at the points that stand out from the empty arena, or are next to one that does (`networks.standing_out`); all
+# others are background. What a finger does to an object depends on where it meets it, which a perceptron learns slowly
+# from coordinates: `networks.contact` says it.
 
 # %%
 ROW = 1
 batch = training.make_batch(data, np.array([ROW]))  # points (1, n, 3) m, valid (1, n), pokes (1, 3), ...
-order = np.random.default_rng(0).permutation(batch.points.shape[1])
-straight = networks.forward_model(shipped.params, sizes, batch.points, batch.valid, batch.pokes)
-shuffled = networks.forward_model(shipped.params, sizes, batch.points[:, order], batch.valid[:, order], batch.pokes)
+look = training.at_rows(batch.look)
+points, valid = batch.points[look], batch.valid[look]  # (1, M, 3), (1, M)
+order = np.random.default_rng(0).permutation(points.shape[1])
+straight = networks.forward_model(shipped.params, sizes, points, valid, batch.pokes)
+shuffled = networks.forward_model(shipped.params, sizes, points[:, order], valid[:, order], batch.pokes)
 order_matters = np.abs(straight.points[:, order] - shuffled.points).max()
-print(f"2. The model sees {batch.points.shape[1]} points of {data.depth_before[ROW].size}; shuffling them changes the "
+print(f"2. The model looks at {points.shape[1]} points of {data.depth_before[ROW].size}; shuffling them changes the "
       f"predicted ones by at most {order_matters:.1e} m")
 
 # %% [markdown]
@@ -81,7 +88,7 @@ print(f"2. The model sees {batch.points.shape[1]} points of {data.depth_before[R
 # the origin and the poke goes along x. Sec. III-G starts with mask 0 ahead of the others and with motions that are
 # the identity.
 #
-# `evaluation.predict` pastes the window back into the picture; outside of it all is background.
+# `evaluation.predict` puts the answer back into the picture; where the model does not look all is background.
 
 # %%
 def predictions(run, pokes):
@@ -101,9 +108,9 @@ true_flow = evaluation.true_motion(data, truth, ROW)[1].reshape(image.shape[:2] 
 longest = np.linalg.norm(true_flow, axis=2).max()
 inside = networks.windows(data.pokes[[ROW]], camera)[0]
 for name, (masks, flow, before, after) in answers.items():
-    print(f"3. {name}: in the window the background has between {masks[0][inside][..., 0].min():.3f} and "
-          f"{masks[0][inside][..., 0].max():.3f} of a point; the longest motion is "
-          f"{100 * np.linalg.norm(after - before, axis=2).max():.2f} cm")
+    shares = masks[0][inside].reshape(-1, sizes.masks)[batch.look[0], 0]
+    print(f"3. {name}: of a point that it looks at, the background has between {shares.min():.3f} and "
+          f"{shares.max():.3f}; the longest motion is {100 * np.linalg.norm(after - before, axis=2).max():.2f} cm")
 
 figure, axes = plt.subplots(2, 6, figsize=(11, 3.6), layout="constrained")
 for line, (name, (masks, flow, *_)) in zip(axes, answers.items()):
@@ -118,7 +125,7 @@ poke_arrow(axes[0, 0], data.starts[ROW], data.pokes[ROW])
 for panel in axes.flat:
     panel.set(xticks=[], yticks=[])
 figure.colorbar(shown, ax=axes, label="share of each point", shrink=0.8)
-figure.suptitle("Before training: nearly the same masks all over the window, no motion. After it: masks on what moves",
+figure.suptitle("Before training: nearly the same masks wherever it looks, no motion. After it: masks on what moves",
                 fontsize=11)
 lesson.keep(options, figure, "masks")
 
@@ -235,7 +242,7 @@ def layer_gradients(run):
 
 
 first = {0: layer_gradients(beginner)}
-untrained = networks.forward_model(beginner.params, beginner.recipe.sizes, fixed.points, fixed.valid, fixed.pokes)
+untrained = training.predict_clouds(beginner.params, beginner.recipe.sizes, fixed)
 print(f"6. Before the first step: longest motion {100 * np.abs(untrained.points - fixed.points).max():.2f} cm")
 with training.workers(1) as gradients:
     for step in range(1, 11):
@@ -308,10 +315,10 @@ for name in ("encoder_1", "encoder_2"):
     by_hand = np.maximum(by_hand @ shipped.params[name + "_w"] + shipped.params[name + "_b"], 0)
 lesson.check("encoder, largest difference to two layers by hand",
              float(np.abs(networks.encode(shipped.params, batch.points) - by_hand).max()), below=1e-4)
-here = batch.valid[0]
-lesson.check("state embedding, largest difference to the mean over the points with depth",
-             float(np.abs(networks.state_embedding(by_hand, batch.valid)[0] - by_hand[0, here].mean(axis=0)).max()),
-             below=1e-5)
+summed = networks.STATE_GAIN * by_hand[0, batch.occupied[0]].sum(axis=0)
+embedding = networks.state_embedding(shipped.params, batch.points, batch.occupied)[0]
+lesson.check("state embedding, largest difference to the sum over the points of objects, relative",
+             float(np.abs(embedding - summed).max() / np.abs(summed).max()), below=1e-5)
 lesson.check("shuffled points, largest difference [m]", float(order_matters), below=1e-4)
 x, y, angle = data.pokes[ROW]
 beyond = np.float32([[[x + 0.1 * np.cos(angle), y + 0.1 * np.sin(angle), 0]]])
@@ -320,11 +327,11 @@ lesson.check("10 cm beyond the target, in the poke's frame: distance to (0.1, 0,
 lesson.check("fresh: longest motion [m]", float(np.abs(answers["fresh"][3] - answers["fresh"][2]).max()), below=1e-5)
 e = np.exp(6 * np.tanh(-1 / 6))  # a mover's logit starts at -1, bounded by 6 tanh(. / 6)
 even = {**fresh.params, "mask_w": 0 * fresh.params["mask_w"]}  # without the random part of the mask layer
-share = networks.forward_model(even, sizes, batch.points, batch.valid, batch.pokes).masks[..., 0]
+share = networks.forward_model(even, sizes, points, valid, batch.pokes).masks[..., 0]
 lesson.check("fresh: background's share of a point, from its bias alone", float(share.mean()), 1 / (1 + 3 * e),
              within=1e-4)
 axes_, origin = networks.poke_axes(batch.pokes)
-local = (batch.points[0] - origin[0]) @ axes_[0]
+local = (points[0] - origin[0]) @ axes_[0]
 moved = sum(straight.masks[0, :, k, None] * (local @ straight.rotations[0, k].T + straight.translations[0, k])
             for k in range(sizes.masks))
 lesson.check("Eq. (1) by hand, largest difference [m]",

@@ -82,7 +82,7 @@ print(f"1. A cloud of {len(view.cloud)} points, {view.occupied.sum()} of them on
 angles = np.linspace(-np.pi, np.pi, 25 if options.quick else 73)
 target = view.cloud[-1, :2]
 pokes = np.float32([[[*target, angle]] for angle in angles])  # (J, H=1, 3)
-step = planning.learned_step(run, camera, view.valid)
+step = planning.learned_step(run, camera, view)
 
 
 def rollout(sequences):
