@@ -121,8 +121,8 @@ def floors(rounds, batch_size=8):
         params = training.unflatten(vector, run.layout)
         prediction, _ = training.run_forward_model(params, sizes, batch, data.camera)
         heatmaps = training.run_inverse_model(params, batch)
-        seen = networks.state_embedding(networks.encode(params, batch.next_points), batch.next_valid)
-        return sum((value * value).sum() for value in (prediction.points, prediction.embedding, seen, *heatmaps))
+        embeddings = training.next_embeddings(params, batch, prediction.points)
+        return sum((value * value).sum() for value in (prediction.points, *embeddings, *heatmaps))
 
     pairs = products_of(network, run.vector)
     trained = training.load_run(data_small() / "checkpoint.npz")

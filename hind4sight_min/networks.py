@@ -233,16 +233,18 @@ def encode(params, points):
     return layer(params, "encoder_2", layer(params, "encoder_1", encoder_features(points)))
 
 
-STATE_GAIN = 3.0  # L_sim beside the cross entropies; of 1, 3, 10, 30, 100: see docs/research-log.md
+STATE_GAIN = 3.0  # L_sim beside the cross entropies; of 1, 3, 10 and more: see docs/research-log.md
 
 
 def state_embedding(params, points, standing):
     """s_t, the sum of the encoder's features over the points of objects. Paper: Sec. III-E.
 
     Of the predicted cloud it is the predicted s'_{t+1}, of the observed one s_{t+1}: an encoder that tells pokes apart
-    also tells how a prediction differs from what happened.  (B, N, 3) m arena, standing (B, N) bool -> (B, E).
+    also tells how a prediction differs from what happened. Its gradient goes to the points, not to the encoder, which
+    would end up saying nothing: then all clouds are alike (docs/research-log.md).
+    (B, N, 3) m arena, standing (B, N) bool -> (B, E).
     """
-    features = encode(params, points)
+    features = encode({name: getval(value) for name, value in params.items()}, points)
     weights = STATE_GAIN * standing[:, None].astype(getval(features).dtype)
     return np.reshape(np.matmul(weights, features), (len(standing), -1))
 

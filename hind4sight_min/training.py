@@ -147,6 +147,16 @@ def run_inverse_model(params, batch):
     return inverse_model(params, batch.before, batch.after, batch.change, batch.cells)
 
 
+def next_embeddings(params, batch, predicted):
+    """The state embeddings of frame t+1, predicted and observed, (B, E) each. Paper: Sec. III-E.
+
+    predicted (B, n, 3) m, arena, of `run_forward_model`. Objects stand out, so only what does is looked at.
+    """
+    look, next_look = at_rows(batch.look), at_rows(batch.next_look)
+    return (state_embedding(params, take(predicted, look), batch.occupied[look]),
+            state_embedding(params, batch.next_points[next_look], batch.next_occupied[next_look]))
+
+
 def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
     """The terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS, or the wanted ones of these: what an
     ablation leaves out takes no time. For a batch with targets, the one term of SE3-Nets.
@@ -163,10 +173,8 @@ def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
                                     ray_spacing(batch.next_points, camera))
 
     def inverse():
-        look, next_look = at_rows(batch.look), at_rows(batch.next_look)
-        embeddings = (state_embedding(params, take(prediction.points, look), batch.occupied[look]),
-                      state_embedding(params, batch.next_points[next_look], batch.next_occupied[next_look]))
-        return losses.inverse_loss(*run_inverse_model(params, batch), batch.start_cells, batch.end_cells, *embeddings)
+        return losses.inverse_loss(*run_inverse_model(params, batch), batch.start_cells, batch.end_cells,
+                                   *next_embeddings(params, batch, prediction.points))
 
     terms = {
         "chamfer": lambda: losses.chamfer_loss(*maps()),

@@ -67,9 +67,11 @@ def test_every_layer_of_the_shipped_checkpoint_is_alive():
     for name, part in training.unflatten(gradient, run.layout).items():
         if name != "heatmaps_b":  # the same for all cells: softmax does not see it
             assert np.abs(part).max() > 1e-6, name
-    prediction, _ = training.run_forward_model(run.params, sizes, batch, data.camera)  # L_sim, Sec. III-E
-    state, predicted, following = (networks.state_embedding(run.params, *cloud) for cloud in (
-        (batch.points, batch.occupied), (prediction.points, batch.occupied), (batch.next_points, batch.next_occupied)))
+    features = networks.encode(run.params, batch.points[batch.occupied])
+    assert (features.max(axis=0) > 1e-3).sum() > 0.7 * sizes.embedding  # L_sim alone would let them die
+    prediction, _ = training.run_forward_model(run.params, sizes, batch, data.camera)
+    predicted, following = training.next_embeddings(run.params, batch, prediction.points)
+    state = networks.state_embedding(run.params, batch.points, batch.occupied)
     assert np.abs(predicted - following).sum() < 0.6 * np.abs(state - following).sum()
 
 

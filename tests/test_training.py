@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from autograd import grad
 
 from hind4sight_min import losses, networks, training
 from hind4sight_min.geometry import Camera, look_at, project, unproject
@@ -53,7 +54,8 @@ def random_run(recipe=TINY, seed=0):
     return run
 
 
-def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
+def test_gradient_of_the_full_loss_against_finite_differences(monkeypatch):  # Eq. (6)
+    monkeypatch.setattr(networks, "STATE_GAIN", 0.0)  # L_sim's gradient is cut at the encoder: a test of its own below
     data, run = pokes_seen(), random_run()
     batch = make_batch(data, np.arange(3))
     for name, value in vars(batch).items():  # float64 throughout
@@ -74,6 +76,30 @@ def test_gradient_of_the_full_loss_against_finite_differences():  # Eq. (6)
         assert abs(expected) > 1e-3
         np.testing.assert_allclose(gradient @ direction, expected, rtol=2e-3)
     assert all(value > 0 for value in terms.values())
+
+
+def test_gradient_of_the_next_embeddings_against_finite_differences():  # L_sim
+    data, run = pokes_seen(), random_run()
+    batch = make_batch(data, np.arange(3))
+    for name, value in vars(batch).items():
+        if value is not None and value.dtype == np.float32:
+            setattr(batch, name, value.astype(float))
+    fixed = unflatten(run.vector.astype(float), run.layout)  # the encoder that compares
+
+    def similarity(vector):
+        prediction = training.predict_clouds(unflatten(vector, run.layout), SIZES, batch)
+        return losses.embedding_loss(*training.next_embeddings(fixed, batch, prediction.points)).sum()
+    vector, step, rng = run.vector.astype(float), 1e-7, np.random.default_rng(1)
+    gradient = grad(similarity)(vector)
+    for _ in range(3):
+        direction = rng.standard_normal(vector.shape)
+        expected = (similarity(vector + step * direction) - similarity(vector - step * direction)) / (2 * step)
+        assert abs(expected) > 1e-2
+        np.testing.assert_allclose(gradient @ direction, expected, rtol=2e-3)
+    weights = dict.fromkeys(training.WEIGHTS, 0.0) | {"inverse": 1.0}
+    parts = [unflatten(batch_gradient(vector, run.layout, SIZES, batch, data.camera, weights)[1], run.layout),
+             unflatten(gradient / 3, run.layout)]
+    np.testing.assert_allclose(*(part["mask_w"] for part in parts), rtol=1e-6)  # nothing else of L_inv reaches masks
 
 
 def test_what_does_not_stand_out_is_background_that_stays(monkeypatch):
