@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from hind4sight_min import networks
 from hind4sight_min.losses import EDGE_SHARPNESS
+from hind4sight_min.ops import LEAK
 
 
 def tensors(batch):
@@ -22,6 +23,10 @@ def tensors(batch):
 
 
 # --- the network ----------------------------------------------------------------------------------------------
+
+def activation(x):
+    return F.leaky_relu(x, float(LEAK))
+
 
 def fourier(values, wavelengths):
     phase = (values[..., None] * (2 * math.pi / torch.tensor(wavelengths, dtype=values.dtype))).flatten(-2)
@@ -77,8 +82,8 @@ def linear(p, name, x):
 
 
 def encode(p, points):
-    x = torch.relu(linear(p, "encoder_1", encoder_features(points)))
-    return torch.relu(linear(p, "encoder_2", x))
+    x = activation(linear(p, "encoder_1", encoder_features(points)))
+    return activation(linear(p, "encoder_2", x))
 
 
 def state_embedding(p, points, standing):
@@ -103,14 +108,14 @@ def forward_model(p, sizes, points, valid, pokes):
     local = (points - origins[:, None]) @ axes
     met, first = contact(local, valid)
     pooling = pooling_weights(local, valid, first)
-    shape = torch.relu(linear(p, "shape_2", torch.relu(linear(p, "shape_1", height_map(local, valid)))))
+    shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
         return torch.cat([(h * valid[..., None]).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
 
-    h = torch.relu(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
+    h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):
-        h = h + torch.relu(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
+        h = h + activation(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
     seen = context(h)
     movers = networks.MASK_BOUND * torch.tanh(linear(p, "mask", h) / networks.MASK_BOUND)
     masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)
@@ -123,7 +128,7 @@ def forward_model(p, sizes, points, valid, pokes):
     cx, cy = (centroids[..., :2] / 0.05).unbind(-1)
     spread = share @ torch.stack([x * x, x * y, y * y], dim=2) - torch.stack([cx * cx, cx * cy, cy * cy], dim=2)
     x = torch.cat([pooled, tops, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1, spread], dim=2)
-    x = torch.relu(linear(p, "motion_2", torch.relu(linear(p, "motion_1", x))))
+    x = activation(linear(p, "motion_2", activation(linear(p, "motion_1", x))))
     twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", x)
     turn = so3_exp(twist[..., 3:])
     shift = centroids - (turn @ centroids[..., None])[..., 0] + twist[..., :3]
@@ -142,16 +147,16 @@ def inverse_model(p, before, after, weights, cells):
     amount = torch.log(weights[..., None] * weights.shape[1] + 1e-3) / 5
     x = torch.cat([poke_features(before - centre[:, None]), poke_features(after - centre[:, None]), amount,
                    encode(p, before), encode(p, after)], dim=2)
-    x = torch.relu(linear(p, "change_2", torch.relu(linear(p, "change_1", x))))
+    x = activation(linear(p, "change_2", activation(linear(p, "change_1", x))))
     seen = weights > 1e-6 * weights.amax(dim=1, keepdim=True)
     pooling = torch.stack([weights, weights ** 0.25, seen], dim=1)
     pooling = pooling / (pooling.sum(dim=2, keepdim=True) + 1e-9)
     context = torch.cat([(x * seen[..., None]).amax(dim=1), (pooling @ x).flatten(1)], dim=1)
-    bias = linear(p, "cell_context_2", torch.relu(linear(p, "cell_context_1", context)))
+    bias = linear(p, "cell_context_2", activation(linear(p, "cell_context_1", context)))
     local = (cells - centre[:, None, :2]).to(before.dtype)
     y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
-    y = torch.relu(torch.relu(linear(p, "cell_1", y)) @ p["cell_2_w"] + bias[:, None])
-    y = torch.relu(linear(p, "cell_3", y))
+    y = activation(activation(linear(p, "cell_1", y)) @ p["cell_2_w"] + bias[:, None])
+    y = activation(linear(p, "cell_3", y))
     return linear(p, "heatmaps", y).unbind(-1)
 
 

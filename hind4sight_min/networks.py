@@ -223,9 +223,9 @@ def init_parameters(sizes, rng, dtype=onp.float32):
 
 # --- the three networks --------------------------------------------------------------------------------------
 
-def layer(params, name, x, relu=True):
-    """The layer `name`: max(x W + b, 0), or x W + b.  (..., I) -> (..., O)."""
-    return dense(x, params[name + "_w"], params[name + "_b"], relu=relu)
+def layer(params, name, x, leaky=True):
+    """The layer `name`: y = x W + b, or max(y, 0.1 y), a leaky ReLU.  (..., I) -> (..., O)."""
+    return dense(x, params[name + "_w"], params[name + "_b"], leaky=leaky)
 
 
 def encode(params, points):
@@ -268,13 +268,13 @@ def forward_model(params, sizes, points, valid, pokes):
 
     h = layer(params, "trunk_0", np.concatenate([poke_features(local), met, encode(params, points)], axis=2))
     for i in range(1, sizes.rounds + 1):
-        bias = layer(params, f"context_{i}", context(h), relu=False)
-        h = dense(h, params[f"trunk_{i}_w"], bias, relu=True, residual=True)
+        bias = layer(params, f"context_{i}", context(h), leaky=False)
+        h = dense(h, params[f"trunk_{i}_w"], bias, leaky=True, residual=True)
     seen = context(h)
 
     # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (it
     # overshoots) would have no gradient left to come back with.
-    logits = np.clip(layer(params, "mask", h, relu=False) / MASK_BOUND, -20, 20)  # tanh is flat there: no overflow
+    logits = np.clip(layer(params, "mask", h, leaky=False) / MASK_BOUND, -20, 20)  # tanh is flat there: no overflow
     movers = MASK_BOUND * np.tanh(logits)
     masks = softmax(np.concatenate([onp.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, N, K)
     rotations, translations = _motions(params, h, masks, seen, local, valid)
@@ -304,7 +304,7 @@ def _motions(params, h, masks, seen, local, valid):
     batch, count = pooled.shape[:2]
     everywhere = np.reshape(seen, (batch, 1, -1)) * onp.ones((1, count, 1), local.dtype)
     x = layer(params, "motion_1", np.concatenate([pooled, tops, everywhere, centroids / 0.1, moments], axis=2))
-    twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), relu=False)  # (B, K-1, 6)
+    twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), leaky=False)  # (B, K-1, 6)
     turn = so3_exp(take(twist, (..., slice(3, None))))
     turned = np.matmul(turn, centroids[..., None])[..., 0]
     shift = centroids - turned + take(twist, (..., slice(0, 3)))
@@ -359,11 +359,11 @@ def inverse_model(params, before, after, weights, cells):
     pooling = onp.stack([weights, weights ** 0.25, seen], axis=1)  # by |P_{t+1} - P_t|^4, |P_{t+1} - P_t| and 1
     pooling = pooling / (pooling.sum(axis=2, keepdims=True) + 1e-9)
     context = pool(x, seen, pooling.astype(before.dtype))  # (B, 4 C): what changed, seen from its centre
-    bias = layer(params, "cell_context_2", layer(params, "cell_context_1", context), relu=False)
+    bias = layer(params, "cell_context_2", layer(params, "cell_context_1", context), leaky=False)
 
     local = (cells - centre[:, None, :2]).astype(before.dtype)  # (B, cells, 2)
     y = onp.concatenate([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], axis=2)
     y = layer(params, "cell_1", y)
-    y = layer(params, "cell_3", dense(y, params["cell_2_w"], bias, relu=True))
-    logits = layer(params, "heatmaps", y, relu=False)
+    y = layer(params, "cell_3", dense(y, params["cell_2_w"], bias, leaky=True))
+    logits = layer(params, "heatmaps", y, leaky=False)
     return take(logits, (..., 0)), take(logits, (..., 1))

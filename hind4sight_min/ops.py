@@ -151,16 +151,19 @@ defvjp(bilinear_sample, _bilinear_image_vjp, _bilinear_position_vjp)
 # autograd's bookkeeping takes some 50 us per operation, there and back: as long as a layer of 48 units takes for 768
 # points. So what belongs together is one operation here.
 
+LEAK = np.float32(0.1)  # slope of the activation below 0: with 0 nine of ten units of the trunk die in a long run
+
+
 @primitive
-def dense(x, weights, bias, *, relu=False, residual=False):
-    """x W + b for every row; with relu=True max(x W + b, 0); with residual=True x is added to that.
+def dense(x, weights, bias, *, leaky=False, residual=False):
+    """y = x W + b for every row; with leaky=True max(y, LEAK y), a leaky ReLU; with residual=True x is added to that.
 
     x (..., I), weights (I, O), bias (O,) or, for x (B, N, I), one per cloud, (B, O) -> (..., O).
     """
     y = np.matmul(x, weights)
     y += bias if bias.ndim == 1 else bias[:, None]
-    if relu:
-        np.maximum(y, 0, out=y)
+    if leaky:
+        np.maximum(y, LEAK * y, out=y)
     if residual:
         y += x
     return y
@@ -168,10 +171,10 @@ def dense(x, weights, bias, *, relu=False, residual=False):
 
 def _dense_vjp(argnums, ans, args, kwargs):
     x, weights, bias = args
-    relu, residual = (kwargs.get(name, False) for name in ("relu", "residual"))
+    leaky, residual = (kwargs.get(name, False) for name in ("leaky", "residual"))
 
     def vjp(g):
-        through = g * (ans > (x if residual else 0)) if relu else g  # where the relu let something through
+        through = g * np.maximum(ans > (x if residual else 0), g.dtype.type(LEAK)) if leaky else g
         rows = through.reshape(-1, through.shape[-1])
 
         def on_x():
@@ -247,10 +250,11 @@ defvjp(take_block, _take_block_vjp, None, None)
 def pool(x, valid, weights):
     """What a cloud holds: the maximum of every channel over the valid points, and weighted sums.
 
-    x (B, N, C) >= 0, valid (B, N) bool, weights (B, R, N) -> (B, (1 + R) C); the maximum is 0 where none is valid.
+    x (B, N, C), valid (B, N) bool, weights (B, R, N) -> (B, (1 + R) C); the maximum is 0 where none is valid.
     Its gradient goes to every valid point that has it.
     """
-    top = _top(x if valid.all() else x * valid[..., None].astype(x.dtype))
+    top = _top(x if valid.all() else np.where(valid[..., None], x, x.dtype.type(-np.inf)))
+    top = np.where(valid.any(axis=1)[:, None], top, x.dtype.type(0))
     return np.concatenate([top, np.matmul(weights, x).reshape(len(x), -1)], axis=1)
 
 
@@ -307,7 +311,7 @@ defvjp_argnums(weighted_means, _weighted_means_vjp)
 
 @primitive
 def weighted_maxima(x, weights):
-    """K weighted maxima of a cloud: max_n w_nk x_n, channel by channel.  x (B, N, C) >= 0, weights (B, N, K) >= 0
+    """K weighted maxima of a cloud: max_n w_nk x_n, channel by channel.  x (B, N, C), weights (B, N, K) >= 0
     -> (B, K, C). The gradient goes to every point that has the maximum.
     """
     return np.stack([_top(x * weights[..., k:k + 1]) for k in range(weights.shape[2])], axis=1)

@@ -224,17 +224,19 @@ def predict(run, camera, view, clouds, pokes):
     """The learned model on clouds (J, N + M, 3) m, where the points of a view went; pokes (J, 3)
     -> clouds after the pokes, and the number of every point's largest mask, (J, N + M) int, 0 = background.
 
-    Of each cloud it looks at the most prominent points whose pixels now lie in the window, as in training; all others
-    stay.
+    The model was trained on windows of the picture, on the points that stand out there. Of a cloud that has moved these
+    are the most prominent of as many points whose pixels lie in the window or nearest to it; all others stay.
     """
-    half = np.array(window_shape(camera)[::-1], np.float32) / 2
+    rows, columns = window_shape(camera)
+    count, half = rows * columns, np.array([columns, rows], np.float32) / 2
     moved, masks = clouds.copy(), np.zeros(clouds.shape[:2], int)
     for first in range(0, len(clouds), CHUNK):
         part = slice(first, first + CHUNK)
         middle = np.array([[(c.start + c.stop - 1) / 2, (r.start + r.stop - 1) / 2]
                            for r, c in windows(pokes[part], camera)], np.float32)
         away = np.abs((project(clouds[part], camera) - middle[:, None]) / half).max(axis=2)  # 1: the window's rim
-        look = standing_out(np.where(away <= 1, np.maximum(view.prominence, 0), -away))
+        near = np.sort(np.argpartition(away, count - 1, axis=1)[:, :count], axis=1)
+        look = np.take_along_axis(near, standing_out(view.prominence[near]), axis=1)
         pick = (np.arange(len(look))[:, None], look)
         found = forward_model(run.params, run.recipe.sizes, clouds[part][pick], view.valid[look],
                               pokes[part].astype(np.float32))

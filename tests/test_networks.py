@@ -102,7 +102,7 @@ def test_gradient_of_every_parameter_against_finite_differences(name):
         return sum((a * b).sum() for a, b in zip((prediction.points, start, end), readout))
 
     direction = rng.standard_normal(params[name].shape)
-    step = 1e-7  # small: with relu and max-pooling a longer step may cross a kink
+    step = 1e-7  # small: with kinks and max-pooling a longer step may cross a kink
     expected = (scalar(params[name] + step * direction) - scalar(params[name] - step * direction)) / (2 * step)
     found = (grad(scalar)(params[name]) * direction).sum()
     assert abs(expected) > 1e-6

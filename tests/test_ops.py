@@ -281,20 +281,20 @@ def test_bilinear_sample_refuses_positions_that_are_not_finite(bad):
 
 # --- the network's layers ---------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("relu", [False, True])
+@pytest.mark.parametrize("leaky", [False, True])
 @pytest.mark.parametrize("shape, per_cloud", [((3, 5, 4), False), ((3, 5, 4), True), ((7, 4), False)])
-def test_dense_and_its_gradients_match_numpy(shape, per_cloud, relu):
+def test_dense_and_its_gradients_match_numpy(shape, per_cloud, leaky):
     rng = np.random.default_rng(9)
     x, weights, bias = rng.normal(size=shape), rng.normal(size=(4, 6)), rng.normal(size=(3, 6) if per_cloud else 6)
     g = rng.normal(size=shape[:-1] + (6,))
 
     def layer(x, weights, bias):
-        return dense(x, weights, bias, relu=relu)
+        return dense(x, weights, bias, leaky=leaky)
     before = np.einsum("...i,io->...o", x, weights) + (bias[:, None] if per_cloud else bias)
     value = layer(x, weights, bias)
     assert value.shape == g.shape
-    np.testing.assert_allclose(value, np.maximum(before, 0) if relu else before, rtol=0, atol=1e-12)
-    through = g * ((before > 0) if relu else 1)
+    np.testing.assert_allclose(value, np.where(before > 0, before, ops.LEAK * before) if leaky else before, rtol=0, atol=1e-12)
+    through = g * (np.where(before > 0, 1, ops.LEAK) if leaky else 1)
     assert 0.2 < (before > 0).mean() < 0.8  # both sides of the kink
     flat = through.reshape(-1, 6)
     expected = (np.einsum("...o,io->...i", through, weights), np.einsum("no,ni->io", flat, x.reshape(-1, 4)),
@@ -315,10 +315,10 @@ def test_a_residual_layer_adds_its_input():
     args = (x, weights, bias)
 
     def residual(*args):
-        return dense(*args, relu=True, residual=True)
+        return dense(*args, leaky=True, residual=True)
 
     def plain(*args):
-        return args[0] + dense(*args, relu=True)
+        return args[0] + dense(*args, leaky=True)
     np.testing.assert_allclose(residual(*args), plain(*args), rtol=1e-12)
     for argnum in range(3):
         np.testing.assert_allclose(pulled_back(residual, argnum, g, *args), pulled_back(plain, argnum, g, *args),
@@ -330,8 +330,8 @@ def test_dense_changes_none_of_its_inputs():
     rng = np.random.default_rng(10)
     inputs = [rng.normal(size=shape) for shape in ((2, 3, 4), (4, 5), (2, 5))]
     copies = [value.copy() for value in inputs]
-    dense(*inputs, relu=True)
-    pulled_back(lambda *args: dense(*args, relu=True), 0, 1.0, *inputs)
+    dense(*inputs, leaky=True)
+    pulled_back(lambda *args: dense(*args, leaky=True), 0, 1.0, *inputs)
     for value, copy in zip(inputs, copies):
         np.testing.assert_array_equal(value, copy)
 
@@ -387,7 +387,8 @@ def test_gradients_of_overlapping_takes_add_up():
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_pool_and_its_gradient_match_a_loop(share):
     rng = np.random.default_rng(13)
-    x, valid, weights = rng.random((3, 6, 4)), rng.random((3, 6)) < share, rng.random((3, 2, 6))
+    x, valid, weights = rng.random((3, 6, 4)) - 0.5, rng.random((3, 6)) < share, rng.random((3, 2, 6))
+    x[..., 0] -= 1  # a channel without anything positive
     x[~valid] += 5  # the largest of all, were they counted
     g = rng.normal(size=(3, 12))
     value, expected, gradient = pool(x, valid, weights), np.zeros((3, 12)), np.zeros_like(x)
@@ -448,7 +449,7 @@ def test_weighted_means_and_their_gradients_match_autograd_of_the_plain_formula(
 
 def test_weighted_maxima_and_their_gradients_match_autograd_of_the_plain_formula():
     rng = np.random.default_rng(24)
-    x, weights, g = rng.random((2, 7, 4)), rng.random((2, 7, 3)), rng.normal(size=(2, 3, 4))
+    x, weights, g = rng.random((2, 7, 4)) - 0.3, rng.random((2, 7, 3)), rng.normal(size=(2, 3, 4))
 
     def plain(x, weights):
         return anp.max(weights[..., None] * x[:, :, None], axis=1)
@@ -513,8 +514,8 @@ def test_total_variation_and_its_gradient_match_autograd_of_the_plain_formula():
 
 # --- dtype ------------------------------------------------------------------------------------------------
 
-def dense_relu(x, weights, bias):
-    return dense(x, weights, bias, relu=True)
+def dense_leaky(x, weights, bias):
+    return dense(x, weights, bias, leaky=True)
 
 
 def dtype_cases():
@@ -532,7 +533,7 @@ def dtype_cases():
     for argnum in range(3):
         yield dense, argnum, (x, weights, bias)
         yield dense, argnum, (x, weights, rng.normal(size=(2, 4)))
-        yield dense_relu, argnum, (x, weights, bias)
+        yield dense_leaky, argnum, (x, weights, bias)
     yield take, 0, (x, (slice(None), slice(1, 3)))
     yield take, 0, (x, (np.array([1, 0]), np.array([3, 4])))
     yield take_block, 0, (bias, 1, (3, 1))

@@ -48,7 +48,7 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 #
 # Write P for the cloud of the picture before the poke, N points in metres, and u for the poke. Every layer is
 #
-#     y = max(x W + b, 0)
+#     z = x W + b,  y = max(z, 0.1 z)
 #
 # applied to each point by itself (`networks.layer`). The *siamese encoder* (Sec. III-E) is two such layers on 20
 # fixed functions of a point's position, `networks.encoder_features`; siamese means that the clouds before and after
@@ -313,7 +313,8 @@ print("8. Check")
 features = networks.encoder_features(batch.points)
 by_hand = features
 for name in ("encoder_1", "encoder_2"):
-    by_hand = np.maximum(by_hand @ shipped.params[name + "_w"] + shipped.params[name + "_b"], 0)
+    by_hand = by_hand @ shipped.params[name + "_w"] + shipped.params[name + "_b"]
+    by_hand = np.where(by_hand > 0, by_hand, 0.1 * by_hand)
 lesson.check("encoder, largest difference to two layers by hand",
              float(np.abs(networks.encode(shipped.params, batch.points) - by_hand).max()), below=1e-4)
 summed = networks.STATE_GAIN * by_hand[0, batch.occupied[0]].sum(axis=0)
