@@ -293,7 +293,8 @@ def test_dense_and_its_gradients_match_numpy(shape, per_cloud, leaky):
     before = np.einsum("...i,io->...o", x, weights) + (bias[:, None] if per_cloud else bias)
     value = layer(x, weights, bias)
     assert value.shape == g.shape
-    np.testing.assert_allclose(value, np.where(before > 0, before, ops.LEAK * before) if leaky else before, rtol=0, atol=1e-12)
+    after = np.where(before > 0, before, ops.LEAK * before) if leaky else before
+    np.testing.assert_allclose(value, after, rtol=0, atol=1e-12)
     through = g * (np.where(before > 0, 1, ops.LEAK) if leaky else 1)
     assert 0.2 < (before > 0).mean() < 0.8  # both sides of the kink
     flat = through.reshape(-1, 6)
