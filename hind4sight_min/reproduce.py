@@ -117,9 +117,14 @@ def _data(folder):
 
 @lru_cache
 def commit():
-    """The commit that the package is of, with "-dirty" where files differ from it; None outside a checkout."""
-    found = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=Path(__file__).parent,
-                           capture_output=True, text=True)
+    """The commit that the package is of, with "-dirty" where files differ from it; None outside a checkout, or without
+    git.
+    """
+    try:
+        found = subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=Path(__file__).parent,
+                               capture_output=True, text=True)
+    except FileNotFoundError:
+        return None
     return found.stdout.strip() if found.returncode == 0 else None
 
 

@@ -91,6 +91,11 @@ def test_the_figures_of_another_recipe_are_not_taken(tmp_path, small_world, monk
         reproduce.run_cell(cell, tmp_path, replace(TINY_SCALE, steps=5))
 
 
+def test_without_git_a_cell_has_no_commit(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert reproduce.commit.__wrapped__() is None
+
+
 def test_a_cell_is_evaluated_under_the_noise_it_was_trained_with(tmp_path, small_world, monkeypatch):
     told = []
     monkeypatch.setattr(evaluation, "evaluate", lambda *_, depth_noise=0.0: told.append(depth_noise) or {})
