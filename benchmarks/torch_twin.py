@@ -87,7 +87,8 @@ def encode(p, points):
 
 
 def state_embedding(p, points, standing):
-    return networks.STATE_GAIN * (encode(p, points) * standing[..., None]).sum(dim=1)
+    fixed = {name: value.detach() for name, value in p.items()}  # its gradient goes to the points alone
+    return networks.STATE_GAIN * (encode(fixed, points) * standing[..., None]).sum(dim=1)
 
 
 def so3_exp(w):
@@ -111,7 +112,7 @@ def forward_model(p, sizes, points, valid, pokes):
     shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
-        return torch.cat([(h * valid[..., None]).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
+        return torch.cat([h.masked_fill(~valid[..., None], -math.inf).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
 
     h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):
@@ -151,7 +152,7 @@ def inverse_model(p, before, after, weights, cells):
     seen = weights > 1e-6 * weights.amax(dim=1, keepdim=True)
     pooling = torch.stack([weights, weights ** 0.25, seen], dim=1)
     pooling = pooling / (pooling.sum(dim=2, keepdim=True) + 1e-9)
-    context = torch.cat([(x * seen[..., None]).amax(dim=1), (pooling @ x).flatten(1)], dim=1)
+    context = torch.cat([x.masked_fill(~seen[..., None], -math.inf).amax(dim=1), (pooling @ x).flatten(1)], dim=1)
     bias = linear(p, "cell_context_2", activation(linear(p, "cell_context_1", context)))
     local = (cells - centre[:, None, :2]).to(before.dtype)
     y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
