@@ -112,7 +112,8 @@ def forward_model(p, sizes, points, valid, pokes):
     shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
-        return torch.cat([h.masked_fill(~valid[..., None], -math.inf).amax(dim=1), (pooling @ h).flatten(1), shape], dim=1)
+        top = h.masked_fill(~valid[..., None], -math.inf).amax(dim=1)
+        return torch.cat([top, (pooling @ h).flatten(1), shape], dim=1)
 
     h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):

@@ -22,7 +22,7 @@ from autograd.tracer import getval
 
 from . import check_whole
 from .geometry import project, so3_exp, transform_layer
-from .ops import dense, pool, softmax, take, weighted_maxima, weighted_means
+from .ops import at_rows, dense, pool, softmax, take, weighted_maxima, weighted_means
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ def most_changed(points, next_points, valid):
     count = min(CHANGED_POINTS, change.shape[1])
     rows = onp.argpartition(-change, count - 1, axis=1)[:, :count]
     weights = onp.take_along_axis(change, rows, axis=1)
-    pick = (onp.arange(len(points))[:, None], rows)
+    pick = at_rows(rows)
     weights = weights / (weights.sum(axis=1, keepdims=True) + onp.finfo(points.dtype).tiny)
     return points[pick], next_points[pick], weights
 

@@ -215,15 +215,20 @@ def _take_vjp(ans, x, key):
 defvjp(take, _take_vjp, None)
 
 
+def at_rows(rows):
+    """The key of the points `rows` (B, M) int of clouds (B, N, ...): clouds[at_rows(rows)] is (B, M, ...)."""
+    return np.arange(len(rows))[:, None], rows
+
+
 @primitive
 def put_rows(clouds, rows, values):
     """The clouds (B, N, D) with their points `rows` (B, M) int, of which none repeats, replaced by values (B, M, D)."""
     result = clouds.copy()
-    result[np.arange(len(rows))[:, None], rows] = values
+    result[at_rows(rows)] = values
     return result
 
 
-defvjp(put_rows, None, None, lambda ans, clouds, rows, values: lambda g: g[np.arange(len(rows))[:, None], rows])
+defvjp(put_rows, None, None, lambda ans, clouds, rows, values: lambda g: g[at_rows(rows)])
 
 
 @primitive

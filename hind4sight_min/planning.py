@@ -15,6 +15,7 @@ from . import check_whole
 from .geometry import project
 from .interactions import cell_centres, cells_of, grid_shape, prominence, standing
 from .networks import forward_model, standing_out, window_shape, windows
+from .ops import at_rows
 
 CHUNK = 16  # candidates per call of the network: more of them leave the processor's cache
 
@@ -237,7 +238,7 @@ def predict(run, camera, view, clouds, pokes):
         away = np.abs((project(clouds[part], camera) - middle[:, None]) / half).max(axis=2)  # 1: the window's rim
         near = np.sort(np.argpartition(away, count - 1, axis=1)[:, :count], axis=1)
         look = np.take_along_axis(near, standing_out(view.prominence[near]), axis=1)
-        pick = (np.arange(len(look))[:, None], look)
+        pick = at_rows(look)
         found = forward_model(run.params, run.recipe.sizes, clouds[part][pick], view.valid[look],
                               pokes[part].astype(np.float32))
         moved[part][pick] = found.points

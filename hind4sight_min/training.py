@@ -19,7 +19,7 @@ from .interactions import (add_depth_noise, associate_with_noise, cell_centres, 
                            points_and_validity, prominence, save_npz, smooth_depth, true_scene_flow)
 from .networks import (Sizes, forward_model, init_parameters, inverse_model, most_changed, standing_out,
                        state_embedding, windows)
-from .ops import put_rows, take, take_block
+from .ops import at_rows, put_rows, take, take_block
 
 FORMAT = "hind4sight_min checkpoint 3"
 
@@ -118,11 +118,6 @@ def associated_targets(interactions, rows, mirror, points, depth, truth, window,
             taken_for = associate_with_noise(picture, rng, window)
             targets[i] = targets[i].reshape(-1, 3)[taken_for.ravel()].reshape(points[i].shape)
     return targets
-
-
-def at_rows(rows):
-    """The key of the points `rows` (B, M) of clouds (B, N, D)."""
-    return onp.arange(len(rows))[:, None], rows
 
 
 def predict_clouds(params, sizes, batch):

@@ -28,7 +28,7 @@ from dataclasses import fields, replace
 import lesson
 import numpy as np
 
-from hind4sight_min import evaluation, geometry, losses, networks, training
+from hind4sight_min import evaluation, geometry, losses, networks, ops, training
 from hind4sight_min.figures import PALETTE, blend, draw_arrow, flow_to_rgb
 
 options = lesson.begin("07_networks")
@@ -67,7 +67,7 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 # %%
 ROW = 1
 batch = training.make_batch(data, np.array([ROW]))  # points (1, n, 3) m, valid (1, n), pokes (1, 3), ...
-look = training.at_rows(batch.look)
+look = ops.at_rows(batch.look)
 points, valid = batch.points[look], batch.valid[look]  # (1, M, 3), (1, M)
 order = np.random.default_rng(0).permutation(points.shape[1])
 straight = networks.forward_model(shipped.params, sizes, points, valid, batch.pokes)
