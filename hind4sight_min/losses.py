@@ -135,6 +135,28 @@ def distance_smoothness_loss(map_predicted, map_observed, images, next_images, v
             + edge_aware_smoothness(np.reshape(map_predicted, grid), images, valid))  # Eq. (5)
 
 
+# --- masks ------------------------------------------------------------------------------------------------
+
+SHARING_REACH = 3  # px; about the radius of an object
+
+
+def sharing_loss(masks, valid):
+    """How often near points move by different masks. Not in the paper.
+
+    L_sh = sum_ij sum_{k != l} m_ik m_jl, over the pairs of pixels (i, j) that lie `SHARING_REACH` apart in a row or a
+    column, and the masks k, l that move. Where two masks move alike, Eq. (2) to (5) do not mind how many of them an
+    object is shared between; this does. Two objects that lie apart may have a mask each.
+    masks (B, H, W, K), 0 the background; valid (B, N) bool -> (B,).
+    """
+    movers = take(masks, (..., slice(1, None))) * onp.reshape(valid, masks.shape[:3] + (1,))
+    ahead, behind = slice(SHARING_REACH, None), slice(None, -SHARING_REACH)
+    total = 0
+    for rest in ((slice(None),), (slice(None), slice(None))):  # down, across
+        a, b = take(movers, (*rest, ahead)), take(movers, (*rest, behind))
+        total = total + np.sum(np.sum(a, axis=3) * np.sum(b, axis=3) - np.sum(a * b, axis=3), axis=(1, 2))
+    return total
+
+
 # --- the inverse model -----------------------------------------------------------------------------------
 
 def heatmap_cross_entropy(logits, cells):
@@ -172,7 +194,8 @@ PAPER_WEIGHTS = {"chamfer": 1e5, "distance_smoothness": 1e5, "photometric": 1e3,
 def full_loss(terms, weights):
     """Paper: Eq. (6), Sec. III-F.  L = lambda_1 L_3D + lambda_2 L_2D + lambda_3 L_inv, averaged over the batch.
 
-    L_3D = L_CD + L_ds and L_2D = L_rec + L_fs; with a weight per term, so that an ablation is a zero.
+    L_3D = L_CD + L_ds and L_2D = L_rec + L_fs; with a weight per term, so that an ablation is a zero. Training adds
+    `sharing_loss`.
     terms: dict of (B,); weights: dict of floats; both with the same keys -> scalar.
     """
     if set(terms) != set(weights) or not terms:

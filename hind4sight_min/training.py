@@ -21,7 +21,7 @@ from .networks import (Sizes, forward_model, init_parameters, inverse_model, mos
                        state_embedding, windows)
 from .ops import at_rows, put_rows, take, take_block
 
-FORMAT = "hind4sight_min checkpoint 3"
+FORMAT = "hind4sight_min checkpoint 4"
 
 
 @dataclass
@@ -152,9 +152,9 @@ def next_embeddings(params, batch, predicted):
             state_embedding(params, batch.next_points[next_look], batch.next_occupied[next_look]))
 
 
-def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
-    """The terms of Eq. (6) -> dict of (B,) with the keys of losses.PAPER_WEIGHTS, or the wanted ones of these: what an
-    ablation leaves out takes no time. For a batch with targets, the one term of SE3-Nets.
+def loss_terms(params, sizes, batch, camera, wanted=None):
+    """The terms of Eq. (6), and the one on masks -> dict of (B,) with the keys of `WEIGHTS`, or the wanted ones of
+    these: what an ablation leaves out takes no time. For a batch with targets, the one term of SE3-Nets.
     """
     if batch.targets is not None:
         prediction = predict_clouds(params, sizes, batch)
@@ -178,8 +178,10 @@ def loss_terms(params, sizes, batch, camera, wanted=losses.PAPER_WEIGHTS):
         "photometric": lambda: losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
         "flow_smoothness": lambda: losses.flow_smoothness_loss(flow, batch.images, batch.valid),
         "inverse": inverse,
+        "sharing": lambda: losses.sharing_loss(np.reshape(prediction.masks, batch.images.shape[:3] + (-1,)),
+                                               batch.valid),
     }
-    return {name: term() for name, term in terms.items() if name in wanted}
+    return {name: term() for name, term in terms.items() if wanted is None or name in wanted}
 
 
 def unflatten(vector, layout):
@@ -212,9 +214,10 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 
 # --- the loop ----------------------------------------------------------------------------------------------
 
-# From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
-# See docs/research-log.md.
-WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0}
+# From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need,
+# that of sharing just heavy enough to decide between masks that move alike. See docs/research-log.md.
+WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
+           "sharing": 0.03}
 ASSOCIATION_WEIGHTS = {"association": 2e3}  # as much as Chamfer, which counts a point in both directions
 
 
@@ -224,8 +227,8 @@ class Recipe:
 
     steps: of the optimiser. batch: interactions per step. learning_rate: peak; linear warm-up over `warmup` steps,
     then a cosine to zero. depth_noise: SD in m of noise added to the depth, Sec. IV-B. image_noise: SD of noise added
-    to the images I_t, in [0, 1]; see below. mirror: show half of the interactions mirrored. weights: one per term of
-    Eq. (6).
+    to the images I_t, in [0, 1]; see below. mirror: show half of the interactions mirrored. weights: one per term, of
+    `WEIGHTS`.
     association: 0, or the baseline SE3-Nets: supervised by the true motion of every point, each of which may be taken
     for any other in a square of so many pixels around it (1: exact; odd). Then the one weight is that of its loss.
 
