@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
 from hind4sight_min import networks
-from hind4sight_min.losses import EDGE_SHARPNESS
+from hind4sight_min.losses import EDGE_SHARPNESS, SHARING_REACH
 from hind4sight_min.ops import LEAK
 
 
@@ -104,7 +104,7 @@ def so3_exp(w):
 
 
 def forward_model(p, sizes, points, valid, pokes):
-    """-> predicted points; networks.forward_model."""
+    """-> predicted points, masks; networks.forward_model."""
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
     met, first = contact(local, valid)
@@ -140,7 +140,7 @@ def forward_model(p, sizes, points, valid, pokes):
     motions = torch.cat([rotations.flatten(2), translations], dim=2)
     still = F.pad(torch.eye(3, dtype=points.dtype).flatten(), (0, 3)).expand(len(points), 1, 12)
     blended = masks @ torch.cat([still, motions], dim=1)
-    return (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:]
+    return (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:], masks
 
 
 def inverse_model(p, before, after, weights, cells):
@@ -215,11 +215,19 @@ def photometric(images, next_images, flow, valid):
     return ((images - warped).abs().sum(dim=3) * (in_view & valid.view(in_view.shape))).sum(dim=(1, 2))
 
 
+def sharing(masks, valid):
+    movers, reach = masks[..., 1:] * valid.view(masks.shape[:3])[..., None], SHARING_REACH
+    pairs = (movers[:, reach:], movers[:, :-reach]), (movers[:, :, reach:], movers[:, :, :-reach])
+    return sum((a.sum(dim=3) * b.sum(dim=3) - (a * b).sum(dim=3)).sum(dim=(1, 2)) for a, b in pairs)
+
+
 def loss_terms(p, sizes, b, camera, nearest):
-    """Batch means of all terms of Eq. (6); training.loss_terms."""
+    """Batch means of all terms; training.loss_terms."""
     look, next_look = ((torch.arange(len(rows))[:, None], rows) for rows in (b["look"], b["next_look"]))
-    found = forward_model(p, sizes, b["points"][look], b["valid"][look], b["pokes"])
+    found, found_masks = forward_model(p, sizes, b["points"][look], b["valid"][look], b["pokes"])
     predicted = b["points"].index_put(look, found)
+    still = F.pad(b["points"].new_ones(*b["points"].shape[:2], 1), (0, sizes.masks - 1))
+    masks = still.index_put(look, found_masks).view(*b["images"].shape[:3], -1)
     embedding = state_embedding(p, found, b["occupied"][look])
     next_embedding = state_embedding(p, b["next_points"][next_look], b["next_occupied"][next_look])
     start, end = inverse_model(p, b["before"], b["after"], b["change"], b["cells"])
@@ -236,6 +244,7 @@ def loss_terms(p, sizes, b, camera, nearest):
         "flow_smoothness": smoothness(flow, images, b["valid"]),
         "inverse": F.cross_entropy(start, b["start_cells"], reduction="none")
         + F.cross_entropy(end, b["end_cells"], reduction="none") + (embedding - next_embedding).abs().mean(dim=1),
+        "sharing": sharing(masks, b["valid"]),
     }
     return {name: value.mean() for name, value in terms.items()}
 

@@ -204,7 +204,7 @@ def init_parameters(sizes, rng, dtype=onp.float32):
         add(f"trunk_{i}", width, width)
         add(f"context_{i}", 5 * width, width, gain=1.0)  # its bias is the trunk layer's
         del params[f"trunk_{i}_b"]
-    add("mask", width, sizes.masks - 1, gain=0.01)
+    add("mask", width, sizes.masks - 1, gain=0.0025)
     params["mask_b"][:] = -1.5  # background first,
     params["mask_b"][0] = -0.5  # then one mask before all others, so that they need not settle who takes what
     add("motion_1", 7 * width + 6, head)

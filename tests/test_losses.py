@@ -1,4 +1,4 @@
-"""Equations 2-6: values and gradients against loops, SciPy and finite differences."""
+"""Equations 2-6 and the loss of masks: values and gradients against loops, SciPy and finite differences."""
 import autograd.numpy as anp
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from hind4sight_min.geometry import Camera, free_radius, look_at, ray_spacing, u
 from hind4sight_min.losses import (PAPER_WEIGHTS, association_loss, chamfer_loss, distance_maps,
                                    distance_smoothness_loss, edge_aware_smoothness, edge_weights, embedding_loss,
                                    flow_smoothness_loss, full_loss, heatmap_cross_entropy, inverse_loss,
-                                   photometric_loss, seen_in_both, warp_backward)
+                                   photometric_loss, seen_in_both, sharing_loss, warp_backward)
 
 B, H, W = 2, 4, 6
 N = H * W
@@ -491,6 +491,51 @@ def test_inverse_loss_is_the_sum_of_both_heatmaps_and_the_embedding():
     np.testing.assert_allclose(pulled_back(inverse_loss, 5, g, *args), -sign, rtol=1e-12)
 
 
+# --- masks --------------------------------------------------------------------------------------------------
+
+def loop_sharing(masks, valid, g):
+    """Over all pairs of pixels -> L_sh, and the gradient of sum(g * L_sh)."""
+    value, gradient, reach = np.zeros(len(masks)), np.zeros(masks.shape), losses.SHARING_REACH
+    valid = valid.reshape(masks.shape[:3])
+    for b, y, x in np.ndindex(masks.shape[:3]):
+        for other in ((b, y + reach, x), (b, y, x + reach)):
+            inside = other[1] < masks.shape[1] and other[2] < masks.shape[2]
+            if inside and valid[b, y, x] and valid[other]:
+                for k in range(1, masks.shape[3]):
+                    for l in set(range(1, masks.shape[3])) - {k}:
+                        value[b] += masks[b, y, x, k] * masks[other][l]
+                        gradient[b, y, x, k] += g[b] * masks[other][l]
+                        gradient[(*other, l)] += g[b] * masks[b, y, x, k]
+    return value, gradient
+
+
+def test_sharing_counts_near_pixels_that_move_by_different_masks():
+    rng = np.random.default_rng(21)
+    masks, valid, g = softmax(rng.normal(size=(B, 5, 7, 4)), axis=3), rng.random((B, 35)) < 0.8, rng.normal(size=B)
+    value, gradient = loop_sharing(masks, valid, g)
+    assert (value > 1).all()
+    np.testing.assert_allclose(sharing_loss(masks, valid), value, rtol=1e-12)
+    np.testing.assert_allclose(pulled_back(sharing_loss, 0, g, masks, valid), gradient, rtol=0, atol=1e-12)
+    check_grads(lambda masks: sharing_loss(masks, valid), modes=["rev"], order=1)(masks)
+
+
+def test_sharing_costs_an_object_cut_in_two_and_not_two_objects_apart():
+    valid = np.ones((1, 10 * 24), bool)
+
+    def cost(*parts):  # (columns, mask) each, 6 pixels high
+        masks = np.zeros((1, 10, 24, 4))
+        for columns, mask in parts:
+            masks[0, 2:8, columns, mask] = 1
+        masks[..., 0] = 1 - masks.sum(axis=3)
+        return sharing_loss(masks, valid)[0]
+    assert cost((slice(3, 9), 1)) == 0
+    assert cost((slice(3, 9), 1), (slice(14, 20), 2)) == 0  # an object each
+    assert cost((slice(3, 6), 1), (slice(6, 9), 2)) == 6 * 3  # each pixel of a row against the one 3 further on
+    masks = np.zeros((1, 10, 24, 4))
+    masks[0, 2:8, 3:9, 1:3] = 0.5  # every pixel in two masks
+    assert sharing_loss(masks, valid)[0] == pytest.approx(0.5 * 2 * 6 * 3)
+
+
 # --- the full model: Eq. (6) ------------------------------------------------------------------------------
 
 def test_paper_weights_are_the_three_lambdas():
@@ -545,6 +590,7 @@ def dtype_cases():
     yield "cross entropy", heatmap_cross_entropy, 0, (logits[0], cells)
     yield "embedding", embedding_loss, 0, tuple(embeddings)
     yield "inverse", inverse_loss, 1, (*logits, cells, cells, *embeddings)
+    yield "sharing", sharing_loss, 0, (softmax(rng.normal(size=(B, H, W, 4)), axis=3), valid)
     yield "full", lambda a, b: full_loss({"a": a, "b": b}, {"a": 2.0, "b": 3.0}), 0, tuple(logits[0])
 
 

@@ -139,8 +139,9 @@ def test_every_term_gets_its_own_arguments():
         "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
         "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid),
         "inverse": losses.heatmap_cross_entropy(start, batch.start_cells)
-        + losses.heatmap_cross_entropy(end, batch.end_cells) + losses.embedding_loss(here, there)}
-    assert set(terms) == set(expected)
+        + losses.heatmap_cross_entropy(end, batch.end_cells) + losses.embedding_loss(here, there),
+        "sharing": losses.sharing_loss(prediction.masks.reshape(batch.images.shape[:3] + (-1,)), batch.valid)}
+    assert set(terms) == set(expected) == set(training.WEIGHTS)
     for name, value in terms.items():
         np.testing.assert_allclose(value, expected[name], rtol=1e-5, err_msg=name)
 
@@ -153,7 +154,8 @@ def test_every_term_reaches_the_forward_model_and_a_weight_of_none_is_refused():
         _, gradient = batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, {**zero, name: 1.0})
         parts = unflatten(gradient, run.layout)
         assert np.abs(parts["encoder_1_w"]).max() > 0, name
-        assert np.abs(parts["mask_w"]).max() > 0 and np.abs(parts["motion_1_w"]).max() > 0, name
+        assert np.abs(parts["mask_w"]).max() > 0, name
+        assert (np.abs(parts["motion_1_w"]).max() > 0) == (name != "sharing"), name
         assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
     with pytest.raises(ValueError, match="weights"):  # nothing to learn from
         batch_gradient(run.vector, run.layout, SIZES, batch, data.camera, zero)
@@ -169,7 +171,7 @@ def test_an_ablated_term_is_not_computed_and_changes_nothing():
     args = run.vector, run.layout, SIZES, batch, data.camera
     whole, gradient = batch_gradient(*args, training.WEIGHTS)
     parts = 0
-    for names in (("chamfer",), ("distance_smoothness", "inverse"), ("photometric", "flow_smoothness")):
+    for names in (("chamfer",), ("distance_smoothness", "inverse"), ("photometric", "flow_smoothness"), ("sharing",)):
         terms, part = batch_gradient(*args, {name: weight * (name in names) for name, weight in
                                              training.WEIGHTS.items()})
         assert terms == {name: whole[name] for name in names}

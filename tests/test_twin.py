@@ -1,4 +1,4 @@
-"""The PyTorch twin of the benchmarks computes what we compute: all terms and the gradient of Eq. (6)."""
+"""The PyTorch twin of the benchmarks computes what we compute: all terms and the gradient of their weighted sum."""
 import sys
 from pathlib import Path
 
