@@ -272,7 +272,7 @@ def interaction_figure(*, image, next_image, points, scene_flow, masks, optical_
 
 TERMS = {"chamfer": "$L_{CD}$ (Eq. 2), m$^2$", "distance_smoothness": "$L_{ds}$ (Eq. 5), m$^2$",
          "photometric": "$L_{rec}$ (Eq. 3), intensity", "flow_smoothness": "$L_{fs}$ (Eq. 4), px",
-         "inverse": "$L_{inv}$ (Sec. III-E), nats"}
+         "inverse": "$L_{inv}$ (Sec. III-E), nats", "sharing": "not in the paper"}
 
 
 def training_figure(log):

@@ -45,7 +45,7 @@ def test_every_model_has_a_recipe_of_the_same_budget(model):
     geometry, picture = {"chamfer", "distance_smoothness"}, {"photometric", "flow_smoothness"}
     assert recipe.association or "sharing" in terms
     assert terms - {"sharing"} == {"2d": picture, "3d": geometry, "2d_3d": geometry | picture,
-                     "full": geometry | picture | {"inverse"}}.get(model, {"association"})
+                                   "full": geometry | picture | {"inverse"}}.get(model, {"association"})
 
 
 def test_a_cell_is_run_once_and_goes_on_where_it_was(tmp_path, small_world, monkeypatch):

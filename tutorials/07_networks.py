@@ -262,10 +262,11 @@ for step, norms in first.items():
 #
 # ## How hard does each term pull?
 #
-# Eq. (6) adds up five terms, each with a weight lambda. It is tempting to choose the weights so that the weighted
-# *values* are alike. But a network is moved by gradients. We compare, at the shipped parameters: a term's weighted
-# value, the norm of its weighted gradient for one poke (median), and that of the mean gradient over the pokes. The
-# mean is what moves the network; where it is far smaller than a single poke's, the pokes disagree.
+# Eq. (6) adds up five terms, each with a weight lambda; a sixth, `losses.sharing_loss`, is ours. It is tempting to
+# choose the weights so that the weighted *values* are alike. But a network is moved by gradients. We compare, at the
+# shipped parameters: a term's weighted value, the norm of its weighted gradient for one poke (median), and that of the
+# mean gradient over the pokes. The mean is what moves the network; where it is far smaller than a single poke's, the
+# pokes disagree.
 
 # %%
 AUDITED = 10 if options.quick else 24
@@ -293,7 +294,7 @@ for i, (label, colour) in enumerate((("value", PALETTE[2]), ("one poke's gradien
                                      ("mean gradient", PALETTE[5]))):
     right.bar(np.arange(len(audit)) + 0.27 * (i - 1), [values[i] for values in audit.values()], 0.27, color=colour,
               label=label)
-right.set(yscale="log", ylim=(0.01, 3e3), ylabel="times the weight of Eq. (6)")
+right.set(yscale="log", ylim=(0.01, 3e3), ylabel="times the weight")
 right.set_xticks(range(len(audit)), [name.replace("_", "\n") for name in audit])
 right.set_title("What a term costs, and how hard it pulls", fontsize=11)
 right.legend(fontsize=9, loc="upper right")
@@ -327,10 +328,11 @@ beyond = np.float32([[[x + 0.1 * np.cos(angle), y + 0.1 * np.sin(angle), 0]]])
 lesson.check("10 cm beyond the target, in the poke's frame: distance to (0.1, 0, 0) [m]",
              float(np.linalg.norm(networks.poke_frame(beyond, data.pokes[[ROW]]) - [0.1, 0, 0])), below=1e-5)
 lesson.check("fresh: longest motion [m]", float(np.abs(answers["fresh"][3] - answers["fresh"][2]).max()), below=1e-5)
-e = np.exp(6 * np.tanh(-1 / 6))  # a mover's logit starts at -1, bounded by 6 tanh(. / 6)
+# The movers' logits start at -1, -3 and -3, bounded by 12 tanh(. / 12).
+e = np.exp(12 * np.tanh(np.array([-1, -3, -3]) / 12)).sum()
 even = {**fresh.params, "mask_w": 0 * fresh.params["mask_w"]}  # without the random part of the mask layer
 share = networks.forward_model(even, sizes, points, valid, batch.pokes).masks[..., 0]
-lesson.check("fresh: background's share of a point, from its bias alone", float(share.mean()), 1 / (1 + 3 * e),
+lesson.check("fresh: background's share of a point, from its bias alone", float(share.mean()), 1 / (1 + e),
              within=1e-4)
 axes_, origin = networks.poke_axes(batch.pokes)
 local = (points[0] - origin[0]) @ axes_[0]

@@ -4,6 +4,7 @@ Question: no loss says what an object is. Do masks appear all the same, when, an
 
 Equations:
 - Eq. (6), the full loss: `training.loss_terms`, `losses.full_loss`; tests/test_training.py, tests/test_losses.py
+- Not in the paper, a price on sharing an object between masks: `losses.sharing_loss`; tests/test_losses.py
 - Eq. (3), why it wants a little noise: `training.Recipe`; tests/test_training.py
 - Sec. III-G, the optimiser, batches, epochs: `training.optimiser_step`, `training.rows_of_step`, `training.learning_rate`, `training.train`; tests/test_training.py
 - Sec. IV-C, the error on held-out pokes: `evaluation.evaluate`; tests/test_evaluation.py
@@ -189,13 +190,15 @@ step, ratio, on, off, iou = np.array(measured).T  # each (epochs + 1,)
 #
 # For each term of Eq. (6) the mean over each epoch, and a dotted line: what no motion costs. A fresh network
 # predicts no motion, so its terms are these lines (of the inverse loss it is what a uniform guess costs). Flow
-# smoothness goes the other way. No motion is perfectly smooth; to move anything at all costs something.
+# smoothness goes the other way. No motion is perfectly smooth; to move anything at all costs something. (A sixth term,
+# which is ours, is not drawn: `losses.sharing_loss`, a small price where near points move by different masks. All terms
+# of Eq. (6) are as content with an object in two masks that move alike.)
 
 # %%
 fresh = training.start_run(recipe, train)
 noisy = training.make_batch(train, np.arange(100), rng=np.random.default_rng(1), image_noise=recipe.image_noise)
 level = training.loss_terms(fresh.params, recipe.sizes, noisy, camera)
-level = {name: float(np.mean(values)) for name, values in level.items() if name in run.log[0]}
+level = {name: float(np.mean(values)) for name, values in level.items() if name in losses.PAPER_WEIGHTS}
 epoch_end = [entry["step"] for entry in run.log]
 shipped = evaluation.evaluate(training.load_run(lesson.data_small() / "checkpoint.npz"), held_out[MEASURED],
                               truth[MEASURED])
