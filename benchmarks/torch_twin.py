@@ -119,7 +119,7 @@ def forward_model(p, sizes, points, valid, pokes):
     for i in range(1, sizes.rounds + 1):
         h = h + activation(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
     seen = context(h)
-    movers = networks.MASK_BOUND * torch.tanh(networks.MASK_SLOPE / networks.MASK_BOUND * linear(p, "mask", h))
+    movers = networks.MASK_BOUND * torch.tanh(linear(p, "mask", h) / networks.MASK_BOUND)
     masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)
 
     moving = masks[..., 1:] * valid[..., None]

@@ -204,9 +204,8 @@ def init_parameters(sizes, rng, dtype=onp.float32):
         add(f"trunk_{i}", width, width)
         add(f"context_{i}", 5 * width, width, gain=1.0)  # its bias is the trunk layer's
         del params[f"trunk_{i}_b"]
-    add("mask", width, sizes.masks - 1, gain=0.0025)
-    params["mask_b"][:] = -1.5  # background first,
-    params["mask_b"][0] = -0.5  # then one mask before all others, so that they need not settle who takes what
+    add("mask", width, sizes.masks - 1, gain=0.01)
+    params["mask_b"] -= 1  # background first
     add("motion_1", 7 * width + 6, head)
     add("motion_2", head, head)
     add("motion_3", head, 6, gain=0.0)
@@ -250,8 +249,7 @@ def state_embedding(params, points, standing):
     return np.reshape(np.matmul(weights, features), (len(standing), -1))
 
 
-MASK_BOUND = 12.0  # a mover's logit stays within so much of the background's, which is 0
-MASK_SLOPE = 2.0  # of the logits in what the layer says: steeper masks are crisper
+MASK_BOUND = 6.0  # a mover's logit stays within so much of the background's, which is 0
 
 
 def forward_model(params, sizes, points, valid, pokes):
@@ -276,8 +274,8 @@ def forward_model(params, sizes, points, valid, pokes):
 
     # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (it
     # overshoots) would have no gradient left to come back with.
-    logits = MASK_SLOPE / MASK_BOUND * layer(params, "mask", h, leaky=False)
-    movers = MASK_BOUND * np.tanh(np.clip(logits, -20, 20))  # tanh is flat there: no overflow
+    logits = np.clip(layer(params, "mask", h, leaky=False) / MASK_BOUND, -20, 20)  # tanh is flat there: no overflow
+    movers = MASK_BOUND * np.tanh(logits)
     masks = softmax(np.concatenate([onp.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, N, K)
     rotations, translations = _motions(params, h, masks, seen, local, valid)
     moved = transform_layer(local, masks, rotations, translations)  # Eq. (1)

@@ -215,9 +215,10 @@ def batch_gradient(vector, layout, sizes, batch, camera, weights):
 # --- the loop ----------------------------------------------------------------------------------------------
 
 # From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need,
-# that of sharing just heavy enough to decide between masks that move alike. See docs/research-log.md.
+# that of sharing, which it reaches at the end, just heavy enough to decide between masks that move alike.
+# See docs/research-log.md.
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
-           "sharing": 0.03}
+           "sharing": 0.05}
 ASSOCIATION_WEIGHTS = {"association": 2e3}  # as much as Chamfer, which counts a point in both directions
 
 
@@ -270,6 +271,13 @@ def learning_rate(recipe, step):
     """Linear warm-up, then a cosine to zero."""
     warm = min(1.0, (step + 1) / max(recipe.warmup, 1))
     return recipe.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / recipe.steps))
+
+
+def weights_at(recipe, step):
+    """The terms' weights in a step. That of sharing rises from 0: masks are found first, then tidied up."""
+    if "sharing" not in recipe.weights:
+        return recipe.weights
+    return {**recipe.weights, "sharing": recipe.weights["sharing"] * (step + 1) / recipe.steps}
 
 
 @dataclass
@@ -354,12 +362,12 @@ def rows_of_step(recipe, count, step):
 CHUNK = 8  # interactions per gradient: enough of them to hide autograd's overhead per operation
 
 
-def chunk_gradient(interactions, truth, mirror, noise_seed, vector, layout, recipe):
+def chunk_gradient(interactions, truth, mirror, noise_seed, vector, layout, recipe, step):
     """`batch_gradient` of a few interactions, weighted by their share of the batch; runs in a worker process."""
     rows, rng = onp.arange(len(interactions)), onp.random.default_rng(noise_seed)
     batch = make_batch(interactions, rows, mirror, recipe.depth_noise, rng, truth=truth, association=recipe.association,
                        image_noise=recipe.image_noise)
-    terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, recipe.weights)
+    terms, gradient = batch_gradient(vector, layout, recipe.sizes, batch, interactions.camera, weights_at(recipe, step))
     share = len(rows) / recipe.batch
     return {name: share * value for name, value in terms.items()}, onp.float32(share) * gradient
 
@@ -392,7 +400,7 @@ def training_step(interactions, run, gradients, truth=None):
     rate = learning_rate(recipe, run.step)
     chunks = [slice(i, i + CHUNK) for i in range(0, recipe.batch, CHUNK)]
     parts = gradients([(interactions[rows[chunk]], truth and truth[rows[chunk]], mirror[chunk], rng.integers(2 ** 32),
-                        run.vector, run.layout, recipe) for chunk in chunks])
+                        run.vector, run.layout, recipe, run.step) for chunk in chunks])
     gradient = sum(part[1] for part in parts)
     if not onp.isfinite(gradient).all():
         raise FloatingPointError(f"the gradient is not finite at step {run.step}")
