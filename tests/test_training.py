@@ -235,6 +235,17 @@ def test_the_gradient_of_a_batch_is_that_of_its_chunks(monkeypatch):
         assert chunks.log[0][name] == pytest.approx(whole.log[0][name], rel=1e-4, abs=1e-5), name
 
 
+def test_the_price_on_sharing_rises_to_its_weight(monkeypatch):
+    data, recipe, seen = pokes_seen(), replace(TINY, steps=4, batch=4), []
+    compute = training.batch_gradient
+    monkeypatch.setattr(training, "batch_gradient", lambda *args: (seen.append(args[-1]), compute(*args))[1])
+    train(data, start_run(recipe, data))
+    np.testing.assert_allclose([weights["sharing"] for weights in seen],
+                               recipe.weights["sharing"] * np.array([0.25, 0.5, 0.75, 1.0]))
+    for weights in seen:
+        assert {**weights, "sharing": recipe.weights["sharing"]} == recipe.weights
+
+
 def test_the_log_is_the_mean_over_the_steps_of_an_epoch(monkeypatch):
     data, recipe, seen = pokes_seen(count=20), replace(TINY, steps=6), []  # four steps an epoch
     step = training.training_step
