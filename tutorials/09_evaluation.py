@@ -14,7 +14,7 @@ Equations:
 Time: 35 s. Pictures: 09_errors.png, 09_noise.png, 09_ablation.png.
 
 Last lines to expect:
-   full model: ratio: expected below 0.85, got 0.4061
+   full model: ratio: expected below 0.85, got 0.3364
 09_evaluation: all checks passed
 """
 # %% [markdown]
