@@ -67,7 +67,7 @@ def test_every_layer_of_the_shipped_checkpoint_is_alive():
     for name, part in training.unflatten(gradient, run.layout).items():
         if name != "heatmaps_b":  # the same for all cells: softmax does not see it
             assert np.abs(part).max() > 1e-6, name
-    features = networks.encode(run.params, batch.points[batch.occupied])
+    features = networks.encode(run.params, batch.points[batch.valid])
     assert (features.max(axis=0) > 1e-3).sum() > 0.7 * sizes.embedding  # units die in long runs, if they may
     prediction, _ = training.run_forward_model(run.params, sizes, batch, data.camera)
     predicted, following = training.next_embeddings(run.params, batch, prediction.points)
