@@ -151,8 +151,9 @@ def sharing_loss(masks, valid):
     movers = take(masks, (..., slice(1, None))) * onp.reshape(valid, masks.shape[:3] + (1,))
     ahead, behind = slice(SHARING_REACH, None), slice(None, -SHARING_REACH)
     total = 0
-    for rest in ((slice(None),), (slice(None), slice(None))):  # down, across
-        a, b = take(movers, (*rest, ahead)), take(movers, (*rest, behind))
+    for axis in (1, 2):
+        before = (slice(None),) * axis
+        a, b = take(movers, (*before, ahead)), take(movers, (*before, behind))
         total = total + np.sum(np.sum(a, axis=3) * np.sum(b, axis=3) - np.sum(a * b, axis=3), axis=(1, 2))
     return total
 
