@@ -94,7 +94,7 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
 
     flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
     an interaction in which nothing moved has no moving point and so no say in it (it still counts for
-    still_epe_cm). flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for
+    still_epe_cm). flow_mse_ratio_se: its standard error, what other pokes, as many, would differ by. flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for
     predicting no motion. still_epe_cm: mean drift of points that do not move; all_epe_cm: of all points.
     mask_iou: mean over the objects that moved. optical_epe_px: over moving points; optical_epe_all_px: over
     all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a poke drawn from the
@@ -103,7 +103,7 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     settings = interactions.meta["settings"]
     sums = dict.fromkeys(("moving", "still", "squared", "motion", "error", "length", "drift", "optical",
                           "optical_zero", "optical_all", "optical_zero_all"), 0.0)
-    ious, pokes, moved_rows = [], [], []
+    ious, pokes, moved_rows, per_poke = [], [], [], []
     for first in range(0, len(interactions), 8):
         rows = np.arange(first, min(first + 8, len(interactions)))
         batch, prediction, flow, start_heatmaps, end_heatmaps = predict(run, interactions, rows, depth_noise)
@@ -124,6 +124,7 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
                                 ("optical_all", pixel_error[batch.valid[i]].sum()),
                                 ("optical_zero_all", pixel_length[batch.valid[i]].sum())):
                 sums[name] += float(value)
+            per_poke.append(((error[moving] ** 2).sum(), (length[moving] ** 2).sum()))
             moved = [label for label in np.unique(labels[moving]) if label > 0]
             if moved:
                 moved_rows.append(row)
@@ -133,11 +134,13 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     if not sums["moving"]:
         raise ValueError("interactions: nothing moved in any of them, so there is nothing to measure")
     moving, everything = sums["moving"], sums["moving"] + sums["still"]
+    ratio, (squared, motion) = sums["squared"] / sums["motion"], np.transpose(per_poke)
     found = np.concatenate(pokes)[moved_rows]
     true_pokes = interactions.pokes[moved_rows]
     shuffled = true_pokes[np.random.default_rng(0).permutation(len(true_pokes))]
     result = {
-        "flow_mse_ratio": sums["squared"] / sums["motion"],
+        "flow_mse_ratio": ratio,
+        "flow_mse_ratio_se": np.sqrt(np.sum((squared - ratio * motion) ** 2)) / sums["motion"],  # the delta method
         "flow_mse_cm2": 1e4 * sums["squared"] / moving,
         "flow_rmse_cm": 100 * np.sqrt(sums["squared"] / moving),
         "flow_epe_cm": 100 * sums["error"] / moving,

@@ -104,6 +104,21 @@ def test_the_ratio_is_pooled_over_all_moving_points(monkeypatch):
     assert found["flow_mse_ratio"] == pytest.approx(4 * 25 / (3 * 25 + 4 * 100), rel=1e-4)
 
 
+def test_standard_error_of_the_ratio_against_pokes_drawn_again(monkeypatch):
+    data, rng = pokes_seen(), np.random.default_rng(3)
+    data = data[np.arange(200) % 7]
+    told, truth = (shifted_block(data, (0.03, 0.04, 0.0)) for _ in range(2))
+    squared, motion = rng.uniform(0, 0.4, 200) ** 2, rng.uniform(0.5, 1.5, 200) ** 2  # in units of the block's 5 cm
+    truth.poses_after[:, 0, :3] *= np.sqrt(motion)[:, None]
+    told.poses_after[:, 0, :3] *= (np.sqrt(motion) + np.sqrt(squared))[:, None]
+    oracle(monkeypatch, data, told, 1.0)
+    found = evaluation.evaluate(start_run(TINY, data), data, truth)
+    assert found["flow_mse_ratio"] == pytest.approx(squared.sum() / motion.sum(), rel=1e-3)
+    drawn = rng.integers(200, size=(4000, 200))
+    again = (squared[drawn].sum(axis=1) / motion[drawn].sum(axis=1)).std()
+    assert found["flow_mse_ratio_se"] == pytest.approx(again, rel=0.05) and again > 1e-3
+
+
 def test_optical_error_of_all_pixels_is_over_those_with_depth(monkeypatch):
     data, drift = pokes_seen(), 0.002
     truth = shifted_block(data, (0.03, 0.04, 0.0))
