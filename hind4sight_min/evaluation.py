@@ -94,11 +94,12 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
 
     flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
     an interaction in which nothing moved has no moving point and so no say in it (it still counts for
-    still_epe_cm). flow_mse_ratio_se: its standard error, what other pokes, as many, would differ by. flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for
-    predicting no motion. still_epe_cm: mean drift of points that do not move; all_epe_cm: of all points.
-    mask_iou: mean over the objects that moved. optical_epe_px: over moving points; optical_epe_all_px: over
-    all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a poke drawn from the
-    set at random. Raises ValueError where nothing moved at all.
+    still_epe_cm). flow_mse_ratio_se: its standard error, by how much other pokes, as many, would change it.
+    flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for predicting no motion.
+    still_epe_cm: mean drift of points that do not move; all_epe_cm: of all points. mask_iou: mean over the objects
+    that moved. optical_epe_px: over moving points; optical_epe_all_px: over all. inverse_*: medians, over pokes that
+    moved something; inverse_*_chance: of a poke drawn from the set at random.
+    Raises ValueError where nothing moved at all.
     """
     settings = interactions.meta["settings"]
     sums = dict.fromkeys(("moving", "still", "squared", "motion", "error", "length", "drift", "optical",

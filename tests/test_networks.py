@@ -317,6 +317,8 @@ def test_standing_out_takes_the_most_prominent_points(monkeypatch):
     for rows, row in zip(standing_out(prominence), prominence):
         np.testing.assert_array_equal(rows, np.sort(np.argsort(row)[-7:]))
     np.testing.assert_array_equal(standing_out(prominence[:, :4]), np.tile(np.arange(4), (3, 1)))  # all there are
+    tied = np.float32([[0, 2, 0, 0, 1, 0, 0, 3, 0, 0, 0]])
+    np.testing.assert_array_equal(standing_out(tied), [[0, 1, 2, 3, 4, 5, 7]])  # of equals the first
 
 
 @pytest.mark.parametrize("name, value", [("masks", 1), ("width", 0), ("head", 0), ("rounds", 0), ("embedding", 0),
