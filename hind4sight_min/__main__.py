@@ -65,6 +65,8 @@ def print_metrics(metrics):
         beside = ""
         if baseline:
             beside = f"   {'chance' if 'chance' in baseline else 'no motion'} {metrics[baseline]:.3g}"
+        elif f"{name}_se" in metrics:
+            beside = f"   standard error {metrics[name + '_se']:.2g}"
         print(f"  {meaning:<40}{metrics[name]:8.3f} {unit:<4}{beside}".rstrip())
 
 

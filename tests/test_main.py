@@ -58,6 +58,7 @@ def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp
     out, err = capsys.readouterr()
     assert err == ""  # no progress line away from a terminal
     assert f"{metrics['flow_mse_ratio']:.3f}" in out and "no motion" in out and "chance" in out
+    assert f"standard error {metrics['flow_mse_ratio_se']:.2g}" in out
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
