@@ -102,8 +102,8 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     Raises ValueError where nothing moved at all.
     """
     settings = interactions.meta["settings"]
-    sums = dict.fromkeys(("moving", "still", "squared", "motion", "error", "length", "drift", "optical",
-                          "optical_zero", "optical_all", "optical_zero_all"), 0.0)
+    sums = dict.fromkeys(("moving", "still", "error", "length", "drift", "optical", "optical_zero", "optical_all",
+                          "optical_zero_all"), 0.0)
     ious, pokes, moved_rows, per_poke = [], [], [], []
     for first in range(0, len(interactions), 8):
         rows = np.arange(first, min(first + 8, len(interactions)))
@@ -118,14 +118,13 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
             pixel_error = np.linalg.norm(flow[i].reshape(-1, 2) - true_pixels, axis=1)
             pixel_length = np.linalg.norm(true_pixels, axis=1)
             for name, value in (("moving", moving.sum()), ("still", still.sum()),
-                                ("squared", (error[moving] ** 2).sum()), ("motion", (length[moving] ** 2).sum()),
                                 ("error", error[moving].sum()), ("length", length[moving].sum()),
                                 ("drift", error[still].sum()), ("optical", pixel_error[moving].sum()),
                                 ("optical_zero", pixel_length[moving].sum()),
                                 ("optical_all", pixel_error[batch.valid[i]].sum()),
                                 ("optical_zero_all", pixel_length[batch.valid[i]].sum())):
                 sums[name] += float(value)
-            per_poke.append(((error[moving] ** 2).sum(), (length[moving] ** 2).sum()))
+            per_poke.append(((error[moving] ** 2).sum(), (length[moving] ** 2).sum()))  # squared error, squared motion
             moved = [label for label in np.unique(labels[moving]) if label > 0]
             if moved:
                 moved_rows.append(row)
@@ -135,20 +134,21 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     if not sums["moving"]:
         raise ValueError("interactions: nothing moved in any of them, so there is nothing to measure")
     moving, everything = sums["moving"], sums["moving"] + sums["still"]
-    ratio, (squared, motion) = sums["squared"] / sums["motion"], np.transpose(per_poke)
+    squared, motion = np.transpose(per_poke).astype(float)
+    ratio = squared.sum() / motion.sum()
     found = np.concatenate(pokes)[moved_rows]
     true_pokes = interactions.pokes[moved_rows]
     shuffled = true_pokes[np.random.default_rng(0).permutation(len(true_pokes))]
     result = {
         "flow_mse_ratio": ratio,
-        "flow_mse_ratio_se": np.sqrt(np.sum((squared - ratio * motion) ** 2)) / sums["motion"],  # the delta method
-        "flow_mse_cm2": 1e4 * sums["squared"] / moving,
-        "flow_rmse_cm": 100 * np.sqrt(sums["squared"] / moving),
+        "flow_mse_ratio_se": np.sqrt(np.sum((squared - ratio * motion) ** 2)) / motion.sum(),  # the delta method
+        "flow_mse_cm2": 1e4 * squared.sum() / moving,
+        "flow_rmse_cm": 100 * np.sqrt(squared.sum() / moving),
         "flow_epe_cm": 100 * sums["error"] / moving,
         "still_epe_cm": 100 * sums["drift"] / max(sums["still"], 1),
         "all_epe_cm": 100 * (sums["error"] + sums["drift"]) / everything,
-        "no_motion_mse_cm2": 1e4 * sums["motion"] / moving,
-        "no_motion_rmse_cm": 100 * np.sqrt(sums["motion"] / moving),
+        "no_motion_mse_cm2": 1e4 * motion.sum() / moving,
+        "no_motion_rmse_cm": 100 * np.sqrt(motion.sum() / moving),
         "no_motion_epe_cm": 100 * sums["length"] / moving,
         "mask_iou": np.mean(ious),
         "optical_epe_px": sums["optical"] / moving,
