@@ -18,9 +18,9 @@ test: .venv/test
 	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test]"
 	touch $@
 
-# The demo simulates, so it asks for pybullet on every Python; from 3.12 on that compiles for some minutes.
+# From Python 3.12 on this leaves pybullet out, which would compile for minutes; the demo then takes the shipped pokes.
 .venv/demo: setup.cfg pyproject.toml | .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[sim]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -e .
 	touch $@
 
 clean:

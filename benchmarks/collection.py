@@ -6,34 +6,33 @@ Runs `collect` with one and with two processes in turn, so that a machine whose 
 the ratio pair by pair and its median, and the share of time inside Bullet's stepping and rendering. About two
 minutes on two cores.
 """
-import argparse
 import statistics
 import tempfile
 from pathlib import Path
 
-from hind4sight_min.interactions import write_json
-from hind4sight_min.simulator import collect
+from race import parser_of, spread
+
+from hind4sight_min.files import write_json
+from hind4sight_min.lab.processes import parallel_map
+from hind4sight_min.sim.collection import collect
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__, rounds=5)
     parser.add_argument("--pokes", type=int, default=600)
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--json")
     args = parser.parse_args()
     speedups, shares = [], []
-    for pair in range(args.pairs):
+    for pair in range(args.rounds):
         seconds = {}
         for jobs in (1, 2):
-            with tempfile.TemporaryDirectory() as folder:
-                result = collect(Path(folder), args.pokes, seed=pair, jobs=jobs)
+            with tempfile.TemporaryDirectory() as folder, parallel_map(jobs) as map:
+                result = collect(Path(folder), args.pokes, seed=pair, map=map)
             seconds[jobs] = result["seconds"]
             shares.append(result["share_in_bullet"])
         speedups.append(seconds[1] / seconds[2])
         print(f"pair {pair + 1}: 1 process {seconds[1]:.1f} s, 2 processes {seconds[2]:.1f} s, "
               f"{speedups[-1]:.2f} times as fast; {args.pokes / seconds[1]:.0f} pokes per second and core", flush=True)
-    figures = {"collect_jobs2_speedup": statistics.median(speedups), "collect_jobs2_speedup_min": min(speedups),
-               "collect_jobs2_speedup_max": max(speedups), "collect_share_in_bullet": statistics.median(shares)}
+    figures = {**spread("collect_jobs2_speedup", speedups), "collect_share_in_bullet": statistics.median(shares)}
     for name, value in figures.items():
         print(f"{name}: {value:.3f}")
     write_json(args.json, figures)

@@ -12,18 +12,15 @@ import argparse
 import json
 import statistics
 from contextlib import contextmanager
-from pathlib import Path
 
 import autograd.numpy as anp
 import cv2
 import numpy as np
 from autograd import grad, value_and_grad
-from matplotlib.figure import Figure
-from race import fastest, race, ratios, report, serve
+from race import ROOT, fastest, parser_of, race, ratios, report, serve, shown, spread
 
 from hind4sight_min import losses
-from hind4sight_min.figures import save_figure
-from hind4sight_min.interactions import write_json
+from hind4sight_min.files import write_json
 
 CHAMFER = ("ours", "torch_1_threads", "torch_2_threads", "point_cloud_utils")
 WARP = ("ours", "torch_1_threads", "torch_2_threads", "scipy")
@@ -129,33 +126,30 @@ def warp(name, height, width):
 
 # --- the comparison -------------------------------------------------------------------------------------------
 
-def measure(what, names, sizes, rounds, figures):
-    """Race all contenders at all sizes, and fill the flat dict of figures."""
+def measure(what, names, sizes, rounds, seconds, figures):
+    """Race the contenders at all sizes, and fill the flat dict of figures."""
     for size in sizes:
         label = "x".join(map(str, size))
         print(f"{what}, {label}", flush=True)
         entered = [name for name in names
                    if what == "warp" or not name.startswith("torch") or size[0] <= LARGEST_BRUTE]
-        times, memory = race(__file__, entered, [what, *size], rounds)
+        times, memory = race(__file__, entered, [what, *size], rounds, seconds)
         report(times, memory)
         for name, values in times.items():
             figures[f"{what}_{label}_{name}_ms"] = 1e3 * statistics.median(values)
             figures[f"{what}_{label}_{name}_mb"] = memory[name]
         for kind in {name.split("_")[0] for name in times} - {"ours"}:
             other = fastest(times, [name for name in times if name.startswith(kind)])
-            if len(times[other]) == len(times["ours"]):
-                speedup, least, most = ratios(times, other, "ours")
-            else:  # measured once
-                speedup = times[other][0] / statistics.median(times["ours"])
-                least, most = (times[other][0] / extreme(times["ours"]) for extreme in (max, min))
-            figures.update({f"{what}_{label}_speedup_vs_{kind}": speedup,
-                            f"{what}_{label}_speedup_vs_{kind}_min": least,
-                            f"{what}_{label}_speedup_vs_{kind}_max": most})
-            print(f"  ours is {speedup:.2f} ({least:.2f} to {most:.2f}) times as fast as {other}", flush=True)
+            speedups = ratios(times, other, "ours")
+            figures.update(spread(f"{what}_{label}_speedup_vs_{kind}", speedups))
+            print(f"  ours is {shown(speedups)} times as fast as {other}", flush=True)
 
 
 def draw(path, operations, step):
     """The figure of docs/speed.md, from the recorded figures of this benchmark and of training_step.py."""
+    from matplotlib.figure import Figure
+
+    from hind4sight_min.lab.figures import save_figure
     figure = Figure(figsize=(11, 3.6), dpi=110, layout="constrained")
     axes = figure.subplots(1, 3)
     styles = {"ours": ("#0072B2", "o"), "torch_1_threads": ("#E69F00", "s"), "torch_2_threads": ("#D55E00", "s"),
@@ -188,9 +182,12 @@ def draw(path, operations, step):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json")
+    parser = parser_of(__doc__, rounds=7)
+    parser.add_argument("--points", type=int, nargs="+", default=POINTS)
+    parser.add_argument("--pictures", type=lambda text: tuple(map(int, text.split("x"))), nargs="+", metavar="HxW",
+                        default=PICTURES)
+    parser.add_argument("--only", nargs="+", default=CHAMFER + WARP, choices=dict.fromkeys(CHAMFER + WARP))
+    parser.add_argument("--seconds", type=float, default=0.5, help="that a turn takes the fastest")
     parser.add_argument("--draw", metavar="PNG", help="measure nothing; draw what docs/results has")
     parser.add_argument("--contender", help=argparse.SUPPRESS)
     parser.add_argument("task", nargs="*", help=argparse.SUPPRESS)
@@ -199,19 +196,17 @@ def main():
         what, *size = args.task
         return serve({"chamfer": chamfer, "warp": warp}[what](args.contender, *map(int, size)))
     if args.draw:
-        results = Path(__file__).resolve().parent.parent / "docs" / "results"
-        return draw(args.draw, *(json.loads((results / f"{name}.json").read_text())["figures"]
+        return draw(args.draw, *(json.loads((ROOT / "docs" / "results" / f"{name}.json").read_text())["figures"]
                                  for name in ("operations", "training_step")))
     figures = {}
-    measure("chamfer", CHAMFER, [(count,) for count in POINTS], args.rounds, figures)
-    measure("warp", WARP, PICTURES, args.rounds, figures)
-    cost = {count: figures[f"chamfer_{count}_ours_ms"] / (count * np.log(count)) for count in (10000, 100000)}
-    figures["chamfer_growth_over_nlogn_10k_to_100k"] = cost[100000] / cost[10000]
-    figures["chamfer_speedup_vs_torch_10k"] = figures["chamfer_10000_speedup_vs_torch"]
-    figures["warp_speedup_vs_grid_sample_min"] = min(figures[f"warp_{h}x{w}_speedup_vs_torch"] for h, w in PICTURES)
-    for name in ("chamfer_growth_over_nlogn_10k_to_100k", "chamfer_speedup_vs_torch_10k",
-                 "warp_speedup_vs_grid_sample_min"):
-        print(f"{name}: {figures[name]:.2f}")
+    for what, names, sizes in (("chamfer", CHAMFER, [(n,) for n in args.points]), ("warp", WARP, args.pictures)):
+        measure(what, [name for name in names if name in args.only], sizes, args.rounds, args.seconds, figures)
+    if {10000, 100000} <= set(args.points):
+        cost = {count: figures[f"chamfer_{count}_ours_ms"] / (count * np.log(count)) for count in (10000, 100000)}
+        figures["chamfer_growth_over_nlogn_10k_to_100k"] = cost[100000] / cost[10000]
+        figures["chamfer_speedup_vs_torch_10k"] = figures["chamfer_10000_speedup_vs_torch"]
+    figures["warp_speedup_vs_grid_sample_min"] = min(figures[f"warp_{h}x{w}_speedup_vs_torch"]
+                                                     for h, w in args.pictures)
     write_json(args.json, figures)
 
 

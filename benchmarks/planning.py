@@ -1,50 +1,77 @@
-"""How long one planning step takes, and where: candidates per second, and the share of time in the forward model.
+"""How long one planning step takes, and where: candidates per second, and the share of time in the model.
 
     python benchmarks/planning.py [--rounds 9] [--json out.json]
+    python benchmarks/planning.py --before DIR     in turns with the same of DIR, a clone of another commit
 
 One step is what the robot waits for between two pokes: the default candidates, iterations and horizon of
-planning.Search, on one core, for the start of test scene 0 with two objects to move. Medians over the rounds.
+planning.Search, on one core, for the start of test scene 0 with two objects to move. Medians over the rounds; each
+checkout plans with the model it ships, and every turn of it is three steps in a process of its own.
 """
-import argparse
+from hind4sight_min import planning, training  # before NumPy: it sets the number of BLAS threads
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
 import time
-from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 
-from hind4sight_min import control, planning, training  # before NumPy: it sets the number of BLAS threads
-from hind4sight_min.__main__ import data_small
-from hind4sight_min.interactions import write_json
+import numpy as np
+from race import DATA, ROOT, parser_of, ratios, spread, start
 
-import numpy as np  # noqa: E402
+from hind4sight_min.files import write_json
+from hind4sight_min.lab.control import first_look, random_task
+
+
+def measure(rounds):
+    """Plan so many steps -> the figures."""
+    run, search, inside, predict = training.load_run(DATA / "checkpoint.npz"), planning.Search(), [], planning.predict
+
+    def timed(*arguments):
+        began = time.perf_counter()
+        result = predict(*arguments)
+        inside.append(time.perf_counter() - began)
+        return result
+
+    planning.predict = timed
+    with random_task(0, 2) as task:
+        camera, settings = task.arena.camera, task.settings
+        _, view, goal = first_look(task)
+    rollout = partial(planning.roll, planning.learned_step(run, view), view, settings=settings)
+    seconds, shares = [], []
+    for seed in range(rounds):
+        inside.clear()
+        began = time.perf_counter()
+        planning.plan(rollout, view, goal, camera, settings, search, np.random.default_rng(seed))
+        seconds.append(time.perf_counter() - began)
+        shares.append(sum(inside) / seconds[-1])
+    median = statistics.median(seconds)
+    return {"plan_step_seconds": median, "plan_share_in_model": statistics.median(shares),
+            "plan_candidates_per_second": search.candidates * search.iterations / median}
+
+
+def speedups_over(before, rounds):
+    """How many times as fast this checkout plans as another one, turn by turn."""
+    seconds = {ROOT: [], before: []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "figures.json"
+        for _ in range(rounds):
+            for checkout, each in seconds.items():
+                if start(__file__, ["--rounds", 3, "--json", path], checkout, stdout=subprocess.DEVNULL).wait():
+                    sys.exit(f"{checkout}: its benchmark does not run")
+                each.append(json.loads(path.read_text())["plan_step_seconds"])
+    return ratios(seconds, before, ROOT)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--json")
+    parser = parser_of(__doc__, rounds=9)
+    parser.add_argument("--before", metavar="DIR", help="a clone of another commit, to compare with")
     args = parser.parse_args()
-    run, search, inside = training.load_run(data_small() / "checkpoint.npz"), planning.Search(), []
-    forward_model = planning.forward_model
-
-    def timed(*arguments):
-        start = time.perf_counter()
-        result = forward_model(*arguments)
-        inside.append(time.perf_counter() - start)
-        return result
-
-    planning.forward_model = timed
-    with control.random_task(0, 2) as task:
-        camera, settings = task.arena.camera, asdict(task.arena.settings)
-        _, view, goal = control.first_look(task)
-    step = planning.learned_step(run, camera, view)
-    seconds, shares = [], []
-    for seed in range(args.rounds):
-        inside.clear()
-        start = time.perf_counter()
-        planning.plan(lambda sequences: planning.roll(step, view, sequences, settings), view, goal, camera, settings,
-                      search, np.random.default_rng(seed))
-        seconds.append(time.perf_counter() - start)
-        shares.append(sum(inside) / seconds[-1])
-    figures = {"plan_step_seconds": float(np.median(seconds)), "plan_share_in_model": float(np.median(shares)),
-               "plan_candidates_per_second": search.candidates * search.iterations / float(np.median(seconds))}
+    figures = measure(args.rounds)
+    if args.before:
+        figures.update(spread("plan_speedup_vs_before", speedups_over(args.before, args.rounds)))
     for name, value in figures.items():
         print(f"{name}: {value:.2f}")
     write_json(args.json, figures)

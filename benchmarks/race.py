@@ -2,13 +2,34 @@
 
 A machine whose speed drifts slows all of them, ratios are taken within a round, and each has a peak memory of its own.
 """
+import argparse
+import os
 import resource
 import statistics
 import subprocess
 import sys
 import time
+from itertools import cycle
 from multiprocessing import active_children
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "data_small"
+
+
+def parser_of(description, rounds):
+    """The command line that all benchmarks have in common."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=rounds)
+    parser.add_argument("--json", metavar="FILE", help="write the figures here too")
+    return parser
+
+
+def start(script, arguments, checkout=ROOT, **options):
+    """Start a benchmark of a checkout, with that checkout's package -> its process."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, Path(checkout) / "benchmarks" / Path(script).name, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, text=True, **options)
 
 
 def serve(contender):
@@ -35,9 +56,8 @@ def _own_peak(pid):
 
 
 class Contender:
-    def __init__(self, script, arguments):
-        self.process = subprocess.Popen([sys.executable, script, *map(str, arguments)], stdin=subprocess.PIPE,
-                                        stdout=subprocess.PIPE, text=True)
+    def __init__(self, script, arguments, checkout):
+        self.process = start(script, arguments, checkout, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def seconds(self, calls):
         """Per call."""
@@ -51,15 +71,17 @@ class Contender:
         return float(self.process.stdout.readlines()[-1])
 
 
-def race(script, names, arguments, rounds, seconds=0.5, hopeless=1e9, patience=5.0):
+def race(script, names, arguments, rounds, seconds, hopeless=1e9, patience=5.0, before=None):
     """Every contender in turn, round after round -> {name: seconds per call of each round}, {name: peak MB}.
 
     A turn has as many calls as take the fastest some `seconds`. What does not run here is left out; what starts off
     `hopeless` times slower than the fastest, or takes longer than `patience` seconds, is measured once and no more.
+    "before_" and a name: the contender of that name of the same script in another checkout, `before`.
     """
     running, first, memory = {}, {}, {}
     for name in names:
-        contender = Contender(script, ["--contender", name, *arguments])
+        checkout = before if name.startswith("before_") else ROOT
+        contender = Contender(script, ["--contender", name.removeprefix("before_"), *arguments], checkout)
         try:
             contender.seconds(2)  # warm up; compile
             first[name] = contender.seconds(1)
@@ -86,12 +108,21 @@ def fastest(times, names):
 
 
 def ratios(times, slow, fast):
-    """How many times faster `fast` is than `slow`: median, least and most over the rounds."""
-    each = [a / b for a, b in zip(times[slow], times[fast])]
-    return statistics.median(each), min(each), max(each)
+    """How many times as fast `fast` is as `slow`, round by round; a slow one may have been measured only once."""
+    return [a / b for a, b in zip(cycle(times[slow]), times[fast])]
+
+
+def spread(name, values):
+    """A figure and its range, for the record."""
+    return {name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values)}
+
+
+def shown(values, digits=2):
+    """The same, to be read."""
+    return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
 def report(times, memory):
     for name, values in times.items():
-        print(f"  {name:<32} {1e3 * statistics.median(values):9.2f} ms ({1e3 * min(values):.2f} to "
-              f"{1e3 * max(values):.2f}, {len(values)} rounds), {memory[name]:.0f} MB", flush=True)
+        print(f"  {name:<32} {shown([1e3 * each for each in values])} ms, {len(values)} rounds, {memory[name]:.0f} MB",
+              flush=True)

@@ -12,14 +12,22 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
 from hind4sight_min import networks
-from hind4sight_min.losses import EDGE_SHARPNESS, SHARING_REACH
+from hind4sight_min.losses import EDGE_SHARPNESS, seen_in_both
 from hind4sight_min.ops import LEAK
+from hind4sight_min.scene import look
 
 
 def tensors(batch):
-    """A training.Batch as a dict of tensors."""
-    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in vars(batch).items()
-            if value is not None}
+    """A training.Batch as a dict of tensors, with the points that the model looks at."""
+    before, after = batch.before, batch.after
+    rows, seen = look(before, batch.pokes)
+    arrays = {name: value for prefix, scene in (("", before), ("next_", after))
+              for name, value in ((prefix + name, value) for name, value in vars(scene).items())}
+    arrays["shared"], arrays["next_shared"] = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    arrays.update(rows=rows, seen=seen, next_rows=look(after, batch.pokes)[0], pokes=batch.pokes)
+    arrays.update(zip(("changed", "next_changed", "change", "centres"), batch.evidence))
+    arrays["start"], arrays["end"] = batch.cells.T
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
 
 
 # --- the network ----------------------------------------------------------------------------------------------
@@ -58,23 +66,26 @@ def poke_axes(pokes):
     return axes, torch.stack([pokes[:, 0], pokes[:, 1], zero], dim=-1)
 
 
-def contact(local, valid):
+def first_met(local, valid):
     x, y, z = local.unbind(-1)
-    central = (1 - (y / networks.REACH) ** 2).clamp(min=0).sqrt()
-    depth = networks.REACH * central - x
-    met = valid & (z > 0.005) & (central > 0) & (x > -0.16) & (depth > 0)
+    central = (1 - (y / networks.FINGER) ** 2).clamp(min=0).sqrt()
+    depth = networks.FINGER * central - x
+    met = valid & (z > networks.ABOVE) & (central > 0) & (x > -0.16) & (depth > 0)
     depth = depth * met
-    deepest = depth.amax(dim=1, keepdim=True)
-    features = torch.stack([depth / 0.05, central, (deepest - depth) / 0.05], dim=2)
-    return features, met * central * torch.exp((depth - deepest) / 0.004)
+    return met * central * torch.exp((depth - depth.amax(dim=1, keepdim=True)) / 0.004)
 
 
-def pooling_weights(local, valid, first):
+def pooling_weights(local, valid):
     x, y, z = local.unbind(-1)
     near = torch.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
     path = torch.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
-    weights = torch.stack([near, path, first], dim=1) * (valid & (z > 0.005))[:, None]
+    weights = torch.stack([near, path, first_met(local, valid)], dim=1) * (valid & (z > networks.ABOVE))[:, None]
     return weights / (weights.sum(dim=2, keepdim=True) + 1e-6)
+
+
+def max_over_points(x, valid):
+    """Over the valid points; 0 where there is none, not -inf."""
+    return x.masked_fill(~valid[..., None], -math.inf).amax(dim=1).masked_fill(~valid.any(dim=1, keepdim=True), 0)
 
 
 def linear(p, name, x):
@@ -86,9 +97,9 @@ def encode(p, points):
     return activation(linear(p, "encoder_2", x))
 
 
-def state_embedding(p, points, standing):
+def state_embedding(p, points, occupied):
     fixed = {name: value.detach() for name, value in p.items()}  # its gradient goes to the points alone
-    return networks.STATE_GAIN * (encode(fixed, points) * standing[..., None]).sum(dim=1)
+    return networks.STATE_GAIN * (encode(fixed, points) * occupied[..., None]).sum(dim=1)
 
 
 def so3_exp(w):
@@ -104,43 +115,43 @@ def so3_exp(w):
 
 
 def forward_model(p, sizes, points, valid, pokes):
-    """-> predicted points, masks; networks.forward_model."""
+    """-> predicted points; networks.forward_model."""
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
-    met, first = contact(local, valid)
-    pooling = pooling_weights(local, valid, first)
+    pooling = pooling_weights(local, valid)
     shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
-        top = h.masked_fill(~valid[..., None], -math.inf).amax(dim=1)
-        return torch.cat([top, (pooling @ h).flatten(1), shape], dim=1)
+        return torch.cat([max_over_points(h, valid), (pooling @ h).flatten(1), shape], dim=1)
 
-    h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), met, encode(p, points)], dim=2)))
+    h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):
         h = h + activation(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
-    seen = context(h)
     movers = networks.MASK_BOUND * torch.tanh(linear(p, "mask", h) / networks.MASK_BOUND)
-    masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)
+    masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)[..., 1:].transpose(1, 2)  # the movers'
 
-    moving = masks[..., 1:] * valid[..., None]
-    share = (moving / (moving.sum(dim=1, keepdim=True) + 1e-3)).transpose(1, 2)
+    moving = masks * valid[:, None]
+    share = moving / (moving.sum(dim=2, keepdim=True) + 1e-3)
     pooled, centroids = share @ h, share @ local
-    tops = torch.stack([(h * moving[..., k:k + 1]).amax(dim=1) for k in range(moving.shape[2])], dim=1)
-    x, y = (local[..., :2] / 0.05).unbind(-1)
-    cx, cy = (centroids[..., :2] / 0.05).unbind(-1)
-    spread = share @ torch.stack([x * x, x * y, y * y], dim=2) - torch.stack([cx * cx, cx * cy, cy * cy], dim=2)
-    x = torch.cat([pooled, tops, seen[:, None].expand(-1, pooled.shape[1], -1), centroids / 0.1, spread], dim=2)
-    x = activation(linear(p, "motion_2", activation(linear(p, "motion_1", x))))
-    twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", x)
+    everywhere = context(h)[:, None].expand(-1, pooled.shape[1], -1)
+    x = activation(linear(p, "motion_1", torch.cat([pooled, everywhere, centroids / 0.1], dim=2)))
+    twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", activation(linear(p, "motion_2", x)))
     turn = so3_exp(twist[..., 3:])
     shift = centroids - (turn @ centroids[..., None])[..., 0] + twist[..., :3]
-    axes, origins = axes[:, None], origins[:, None]
-    rotations = axes @ turn @ axes.transpose(2, 3)
-    translations = (axes @ shift[..., None])[..., 0] + origins - (rotations @ origins[..., None])[..., 0]
-    motions = torch.cat([rotations.flatten(2), translations], dim=2)
-    still = F.pad(torch.eye(3, dtype=points.dtype).flatten(), (0, 3)).expand(len(points), 1, 12)
-    blended = masks @ torch.cat([still, motions], dim=1)
-    return (blended[..., :9].unflatten(2, (3, 3)) @ points[..., None])[..., 0] + blended[..., 9:], masks
+    moved = local[:, None] @ turn.transpose(2, 3) + shift[:, :, None]
+    return points + (masks[..., None] * (moved - local[:, None])).sum(dim=1) @ axes.transpose(1, 2)
+
+
+def at(rows):
+    return torch.arange(len(rows))[:, None], rows
+
+
+def predict(p, sizes, b):
+    """-> all predicted points; networks.predict."""
+    rows = at(b["rows"])
+    points = b["points"][rows]
+    found = forward_model(p, sizes, points, b["seen"], b["pokes"])
+    return b["points"].index_put(rows, torch.where(b["seen"][..., None], found, points))
 
 
 def inverse_model(p, before, after, weights, cells):
@@ -153,7 +164,7 @@ def inverse_model(p, before, after, weights, cells):
     seen = weights > 1e-6 * weights.amax(dim=1, keepdim=True)
     pooling = torch.stack([weights, weights ** 0.25, seen], dim=1)
     pooling = pooling / (pooling.sum(dim=2, keepdim=True) + 1e-9)
-    context = torch.cat([x.masked_fill(~seen[..., None], -math.inf).amax(dim=1), (pooling @ x).flatten(1)], dim=1)
+    context = torch.cat([max_over_points(x, seen), (pooling @ x).flatten(1)], dim=1)
     bias = linear(p, "cell_context_2", activation(linear(p, "cell_context_1", context)))
     local = (cells - centre[:, None, :2]).to(before.dtype)
     y = torch.cat([local / 0.1, fourier(local, (0.4, 0.2, 0.1, 0.05))], dim=2)
@@ -215,22 +226,12 @@ def photometric(images, next_images, flow, valid):
     return ((images - warped).abs().sum(dim=3) * (in_view & valid.view(in_view.shape))).sum(dim=(1, 2))
 
 
-def sharing(masks, valid):
-    movers, reach = masks[..., 1:] * valid.view(masks.shape[:3])[..., None], SHARING_REACH
-    pairs = (movers[:, reach:], movers[:, :-reach]), (movers[:, :, reach:], movers[:, :, :-reach])
-    return sum((a.sum(dim=3) * b.sum(dim=3) - (a * b).sum(dim=3)).sum(dim=(1, 2)) for a, b in pairs)
-
-
 def loss_terms(p, sizes, b, camera, nearest):
     """Batch means of all terms; training.loss_terms."""
-    look, next_look = ((torch.arange(len(rows))[:, None], rows) for rows in (b["look"], b["next_look"]))
-    found, found_masks = forward_model(p, sizes, b["points"][look], b["valid"][look], b["pokes"])
-    predicted = b["points"].index_put(look, found)
-    still = F.pad(b["points"].new_ones(*b["points"].shape[:2], 1), (0, sizes.masks - 1))
-    masks = still.index_put(look, found_masks).view(*b["images"].shape[:3], -1)
-    embedding = state_embedding(p, found, b["occupied"][look])
-    next_embedding = state_embedding(p, b["next_points"][next_look], b["next_occupied"][next_look])
-    start, end = inverse_model(p, b["before"], b["after"], b["change"], b["cells"])
+    predicted, rows, next_rows = predict(p, sizes, b), at(b["rows"]), at(b["next_rows"])
+    embedding = state_embedding(p, predicted[rows], b["occupied"][rows])
+    next_embedding = state_embedding(p, b["next_points"][next_rows], b["next_occupied"][next_rows])
+    start, end = inverse_model(p, b["changed"], b["next_changed"], b["change"], b["centres"])
     images, next_images = b["images"], b["next_images"]
     flow = (project(predicted, camera) - project(b["points"], camera)).view(*images.shape[:3], 2)
     here = distance_map(predicted, b["next_points"], b["next_shared"], b["shared"], nearest)
@@ -242,9 +243,8 @@ def loss_terms(p, sizes, b, camera, nearest):
         + smoothness(here.view(grid), images, b["shared"]),
         "photometric": photometric(images, next_images, flow, b["shared"]),
         "flow_smoothness": smoothness(flow, images, b["valid"]),
-        "inverse": F.cross_entropy(start, b["start_cells"], reduction="none")
-        + F.cross_entropy(end, b["end_cells"], reduction="none") + (embedding - next_embedding).abs().mean(dim=1),
-        "sharing": sharing(masks, b["valid"]),
+        "inverse": F.cross_entropy(start, b["start"], reduction="none")
+        + F.cross_entropy(end, b["end"], reduction="none") + (embedding - next_embedding).abs().mean(dim=1),
     }
     return {name: value.mean() for name, value in terms.items()}
 

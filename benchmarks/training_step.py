@@ -1,30 +1,35 @@
 """A training step of the full model: ours against PyTorch's.
 
     python benchmarks/training_step.py --json docs/results/training_step.json     (needs the extra "bench")
+    python benchmarks/training_step.py --before DIR     and against ours in DIR, a clone of another commit
 
-Every contender makes the same steps on the same pokes: batch, forward, losses, backward, optimiser. BLAS has one thread in
-our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
+Every contender makes the same steps on the same pokes: batch, forward, losses, backward, optimiser. BLAS has one thread
+in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
 fastest median counts. Memory is the peak, a worker's own pages added to its parent's (Linux only).
 
 Also the floor: how long the bare matrix products of the network and the bare KD-trees of the Chamfer distance take,
-which no implementation can do without (ours avoids searches whose result is known). Some ten minutes on two cores.
+which no implementation can do without where all points move. Some ten minutes on two cores.
 """
+import hind4sight_min  # noqa: F401  before NumPy: it sets the number of BLAS threads
+
 import argparse
 import statistics
-import time
 from contextlib import contextmanager
+from timeit import repeat
 
 import numpy as np
 from autograd import grad
 from autograd.tracer import getval, isbox
-from race import fastest, race, ratios, report, serve
+from race import DATA, fastest, parser_of, race, ratios, report, serve, shown, spread
 from scipy.spatial import cKDTree
 
-from hind4sight_min import geometry, losses, networks, training
-from hind4sight_min.__main__ import data_small
-from hind4sight_min.interactions import load_interactions, write_json
+from hind4sight_min import losses, networks, training
+from hind4sight_min.files import write_json
+from hind4sight_min.interactions import load_interactions
+from hind4sight_min.lab.processes import parallel_map
+from hind4sight_min.ops import at_rows, take, unflatten
+from hind4sight_min.scene import look
 
-DATA = data_small() / "train"
 OURS = ("ours_1_process", "ours_2_processes")
 TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree", "brute")
               for mode in ("eager", "compiled") for threads in (1, 2))
@@ -35,10 +40,10 @@ TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree"
 @contextmanager
 def ours(batch, jobs):
     """The steps of training.train, one at a time, its worker processes kept."""
-    data = load_interactions(DATA)
+    data = load_interactions(DATA / "train")
     run = training.start_run(training.Recipe(steps=10 ** 6, batch=batch), data)
-    with training.workers(jobs) as gradients:
-        yield lambda: training.training_step(data, run, gradients)
+    with parallel_map(jobs) as map:
+        yield lambda: training.training_step(data, run, map=map)
 
 
 @contextmanager
@@ -46,7 +51,7 @@ def twin(batch, chamfer, mode, threads):
     import torch
     import torch_twin
     torch.set_num_threads(threads)
-    data = load_interactions(DATA)
+    data = load_interactions(DATA / "train")
     recipe = training.Recipe(steps=10 ** 6, batch=batch)
     run = training.start_run(recipe, data)
     params = {name: torch.from_numpy(value.copy()).requires_grad_() for name, value in run.params.items()}
@@ -60,133 +65,118 @@ def twin(batch, chamfer, mode, threads):
     loss = torch.compile(torch_twin.full_loss) if mode == "compiled" else torch_twin.full_loss
 
     def step():
-        rows, mirror, _ = training.rows_of_step(recipe, len(data), run.step)
-        tensors = torch_twin.tensors(training.make_batch(data, rows, mirror))
+        rows = training.rows_of_step(recipe, len(data), run.step)
+        batch = training.make_batch(data[rows], recipe, np.random.default_rng(run.step))
+        tensors = torch_twin.tensors(batch)
         for optimiser in optimisers:
             optimiser.zero_grad()
-        loss(params, recipe.sizes, tensors, data.camera, training.WEIGHTS, nearest).backward()
+        loss(params, recipe.sizes, tensors, data.camera, recipe.weights, nearest).backward()
         for optimiser in optimisers:
             optimiser.step()
         run.step += 1
     yield step
 
 
-def work(name, batch):
+def contender(name, batch):
     if name in OURS:
-        return serve(ours(batch, jobs=1 + OURS.index(name)))
+        return ours(batch, jobs=1 + OURS.index(name))
     _, chamfer, mode, threads, _ = name.split("_")
-    return serve(twin(batch, chamfer, mode, int(threads)))
+    return twin(batch, chamfer, mode, int(threads))
 
 
 # --- the floor ---------------------------------------------------------------------------------------------------
 
 def products_of(network, vector):
     """All matrix products of a network's layers, forward and back, as a list of pairs of matrices."""
-    shapes = []
+    pairs, dense = [], networks.dense
 
     def recorded(x, weights, bias, **options):
-        shapes.append((x.shape, weights.shape, isbox(x)))
-        return dense(x, weights, bias, **options)
-    dense, networks.dense = networks.dense, recorded
+        y = dense(x, weights, bias, **options)
+        rows, w, g = getval(x), getval(weights), getval(y)
+        pairs.extend([(rows, w), (rows.reshape(-1, len(w)).T, g.reshape(-1, g.shape[-1]))])
+        if isbox(x):  # something below it learns
+            pairs.append((g, w.T))
+        return y
+
+    networks.dense = recorded
     try:
         grad(network)(vector)
     finally:
         networks.dense = dense
-    rng, pairs = np.random.default_rng(0), []
-    for shape, (inputs, outputs), traced in shapes:
-        x, w, g = (rng.standard_normal(size).astype(np.float32)
-                   for size in (shape, (inputs, outputs), shape[:-1] + (outputs,)))
-        pairs.append((x, w))
-        pairs.append((x.reshape(-1, inputs).T, g.reshape(-1, outputs)))
-        if traced:  # something below it learns
-            pairs.append((g, w.T))
     return pairs
 
 
-def seconds_of(call):
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
-
-
-def floors(rounds, batch_size=8):
+def floors(rounds, count=8):
     """The network and the Chamfer distance of one gradient, against the bare products and trees, on one thread."""
-    data = load_interactions(DATA)
+    data, rng = load_interactions(DATA / "train")[:count], np.random.default_rng(0)
     run = training.start_run(training.Recipe(), data)
-    rng = np.random.default_rng(0)
-    run.vector = run.vector + 0.02 * rng.standard_normal(run.vector.shape).astype(np.float32)
-    batch, sizes = training.make_batch(data, np.arange(batch_size)), run.recipe.sizes
+    vector = run.vector + 0.02 * rng.standard_normal(run.vector.shape).astype(np.float32)
+    batch, sizes = training.make_batch(data, run.recipe, rng), run.recipe.sizes
+    before, after = batch.before, batch.after
+    valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    rows, next_rows = (at_rows(look(scene, batch.pokes)[0]) for scene in (before, after))
 
     def network(vector):
-        params = training.unflatten(vector, run.layout)
-        prediction, _ = training.run_forward_model(params, sizes, batch, data.camera)
-        heatmaps = training.run_inverse_model(params, batch)
-        embeddings = training.next_embeddings(params, batch, prediction.points)
-        return sum((value * value).sum() for value in (prediction.points, *embeddings, *heatmaps))
+        params = unflatten(vector, run.layout)
+        predicted = networks.predict(params, sizes, before, batch.pokes).points
+        outputs = (predicted, *networks.inverse_model(params, *batch.evidence),
+                   networks.state_embedding(params, take(predicted, rows), before.occupied[rows]),
+                   networks.state_embedding(params, after.points[next_rows], after.occupied[next_rows]))
+        return sum((value * value).sum() for value in outputs)
 
-    pairs = products_of(network, run.vector)
-    trained = training.load_run(data_small() / "checkpoint.npz")
-    predicted = training.run_forward_model(trained.params, trained.recipe.sizes, batch, data.camera)[0].points
+    def chamfer(predicted):
+        return losses.chamfer_loss(*losses.distance_maps(predicted, after.points, valid, next_valid)).sum()
+
+    pairs = products_of(network, vector)
+    moved = before.points + 1e-3 * rng.standard_normal(before.points.shape).astype(np.float32)
 
     def bare_products():
         for a, b in pairs:
             np.matmul(a, b)
 
-    def chamfer(predicted, spare):
-        free = (geometry.free_radius(batch.points, getval(predicted),
-                                     geometry.ray_spacing(batch.points, data.camera)),
-                geometry.ray_spacing(batch.next_points, data.camera)) if spare else ()
-        maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared, *free)
-        return losses.chamfer_loss(*maps).sum()
-
     def bare_trees():
-        for p, q, valid, next_valid in zip(predicted, batch.next_points, batch.shared, batch.next_shared):
-            cKDTree(q[next_valid], compact_nodes=False, balanced_tree=False).query(p)
-            cKDTree(p[valid], compact_nodes=False, balanced_tree=False).query(q)
+        for p, q, here, there in zip(moved, after.points, valid, next_valid):
+            cKDTree(q[there], compact_nodes=False, balanced_tree=False).query(p)
+            cKDTree(p[here], compact_nodes=False, balanced_tree=False).query(q)
 
     figures = {}
-    for name, call, bare in (("network_over_matmul_floor", lambda: grad(network)(run.vector), bare_products),
-                             ("chamfer_over_kdtree_floor", lambda: grad(chamfer)(predicted, False), bare_trees),
-                             ("chamfer_in_step_over_kdtree_floor", lambda: grad(chamfer)(predicted, True), bare_trees)):
-        call(), bare()
-        each = [(min(seconds_of(call) for _ in range(5)), min(seconds_of(bare) for _ in range(5)))
-                for _ in range(rounds)]
-        values = [a / b for a, b in each]
-        figures.update({name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values),
-                        f"{name}_bare_ms": 1e3 * statistics.median(b for _, b in each) / batch_size})
-        print(f"{name}: {statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f}); the floor is "
-              f"{figures[f'{name}_bare_ms']:.2f} ms per interaction", flush=True)
+    for name, call, bare in (("network_over_matmul_floor", lambda: grad(network)(vector), bare_products),
+                             ("chamfer_over_kdtree_floor", lambda: grad(chamfer)(moved), bare_trees)):
+        each = [[min(repeat(function, number=1)) for function in (call, bare)] for _ in range(rounds)]
+        values, bare_ms = [a / b for a, b in each], 1e3 * statistics.median(b for _, b in each) / count
+        figures.update({**spread(name, values), f"{name}_bare_ms": bare_ms})
+        print(f"{name}: {shown(values)}; the floor is {bare_ms:.2f} ms per interaction", flush=True)
     return figures
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9)
+    parser = parser_of(__doc__, rounds=9)
     parser.add_argument("--batch", type=int, nargs="+", default=[16, 4, 64], help="the first counts, the default one")
     parser.add_argument("--only", nargs="+", choices=OURS + TWINS, default=OURS + TWINS)
+    parser.add_argument("--seconds", type=float, default=1.0, help="that a turn takes the fastest")
+    parser.add_argument("--before", metavar="DIR", help="a clone of another commit, to race against")
     parser.add_argument("--contender", choices=OURS + TWINS, help=argparse.SUPPRESS)
-    parser.add_argument("--json")
     args = parser.parse_args()
     if args.contender:
-        return work(args.contender, args.batch[0])
+        return serve(contender(args.contender, args.batch[0]))
+    before = tuple(f"before_{name}" for name in OURS if args.before and name in args.only)
     figures = floors(args.rounds)
     for batch in args.batch:
         print(f"a step of {batch} interactions")
-        times, memory = race(__file__, args.only, ["--batch", batch], args.rounds, seconds=1.0,
-                             hopeless=3.0)
+        times, memory = race(__file__, (*args.only, *before), ["--batch", batch], args.rounds, args.seconds, hopeless=3.0,
+                             before=args.before)
         report(times, memory)
         figures.update({f"{name}_batch_{batch}_ms": 1e3 * statistics.median(values) for name, values in times.items()})
         figures.update({f"{name}_batch_{batch}_mb": value for name, value in memory.items()})
-        own, other = (fastest(times, names) for names in (OURS, TWINS))
-        speedup, least, most = ratios(times, other, own)
-        share = memory[own] / memory[other]
-        print(f"{own} is {speedup:.2f} ({least:.2f} to {most:.2f}) times as fast as {other}, with {share:.2f} of its "
-              "memory", flush=True)
         suffix = "" if batch == args.batch[0] else f"_batch_{batch}"
-        figures.update({f"train_step_speedup_vs_torch{suffix}": speedup,
-                        f"train_step_speedup_vs_torch{suffix}_min": least,
-                        f"train_step_speedup_vs_torch{suffix}_max": most,
-                        f"train_step_memory_vs_torch{suffix}": share})
+        for peer, names in (("torch", TWINS), ("before", before)):
+            if not times.keys() & set(names):
+                continue
+            own, other = fastest(times, OURS), fastest(times, names)
+            speedups, share = ratios(times, other, own), memory[own] / memory[other]
+            print(f"{own} is {shown(speedups)} times as fast as {other}, with {share:.2f} of its memory", flush=True)
+            figures.update(spread(f"train_step_speedup_vs_{peer}{suffix}", speedups))
+            figures[f"train_step_memory_vs_{peer}{suffix}"] = share
     write_json(args.json, figures)
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 from PIL import Image
 
-from hind4sight_min.interactions import whole_file, write_text
+from hind4sight_min.files import whole_file, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 TUTORIALS, PAGE, PICTURES = ROOT / "tutorials", ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery"
@@ -88,16 +88,27 @@ class Tutorial:
         return self.path.name[:2]
 
 
+def module_of(name):
+    """`losses` of `losses.chamfer_loss`, `lab.evaluation` of `lab.evaluation.ask`."""
+    parts = name.split(".")
+    return ".".join(parts[:1 + (parts[0] in ("sim", "lab"))])
+
+
+def source_of(name):
+    """The file of a function: hind4sight_min/lab/evaluation.py of `lab.evaluation.ask`."""
+    return f"hind4sight_min/{module_of(name).replace('.', '/')}.py"
+
+
 def function_exists(name):
-    """Is `module.function` or `module.Class.method` in the package?"""
-    module, *attributes = name.split(".")
+    """Is `module.function`, `module.Class.method` or `lab.module.function` in the package?"""
+    module = module_of(name)
     try:
         found = importlib.import_module(f"hind4sight_min.{module}")
-        for attribute in attributes:
+        for attribute in filter(None, name[len(module):].split(".")):
             found = getattr(found, attribute)
     except (ModuleNotFoundError, AttributeError):
         return False
-    return bool(attributes)
+    return name != module
 
 
 def parse(path):
@@ -181,7 +192,7 @@ def equation_map(found):
     for what in sorted(rows, key=place_in_paper):
         functions, tests, scripts = rows[what]
         lines.append([what,
-                      ", ".join(link(f"hind4sight_min/{name.split('.')[0]}.py", f"`{name}`") for name in functions),
+                      ", ".join(link(source_of(name), f"`{name}`") for name in functions),
                       ", ".join(link(name, f"`{Path(name).name}`") for name in tests),
                       ", ".join(link(f"tutorials/{name}", name[:2]) for name in scripts)])
     return table(["paper", "functions", "tests", "tutorial"], lines)

@@ -8,15 +8,21 @@ minute.
 """
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
-from hind4sight_min import evaluation, losses, training  # before NumPy: it sets the number of BLAS threads
-from hind4sight_min.__main__ import data_small
-from hind4sight_min.figures import blend, draw_arrow, flow_to_rgb, save_figure, show_image
-from hind4sight_min.geometry import optical_flow, project
-from hind4sight_min.interactions import load_interactions, load_truth, write_text
-from hind4sight_min.objects import HELD_OUT
-from hind4sight_min.simulator import Settings, collect
+from hind4sight_min import losses, training  # before NumPy: it sets the number of BLAS threads
+from hind4sight_min.files import write_text
+from hind4sight_min.geometry import optical_flow
+from hind4sight_min.interactions import load_interactions
+from hind4sight_min.lab import evaluation
+from hind4sight_min.lab.cli import data_small
+from hind4sight_min.lab.figures import blend, draw_arrow, flow_to_rgb, on_table, save_figure, show_image
+from hind4sight_min.lab.noise import with_depth_noise
+from hind4sight_min.sim.arena import Settings
+from hind4sight_min.sim.collection import collect
+from hind4sight_min.sim.objects import HELD_OUT
+from hind4sight_min.sim.truth import load_truth
 
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
@@ -35,41 +41,43 @@ def moved_labels(truth, row):
     return np.flatnonzero(shift > 1e-3) + 1
 
 
-def terms_at(batch, moves, camera):
-    """The four terms without parameters, weighted, for a scene flow `moves` (B, n, 3) -> {name: (B,)}."""
-    predicted = (batch.points + moves).astype(np.float32)
-    maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared)
-    flow = optical_flow(batch.points, predicted, camera).reshape(batch.images.shape[:3] + (2,))
+def terms_at(before, after, moves, camera):
+    """The four terms without parameters, weighted, for a scene flow `moves` (B, N, 3) -> {name: (B,)}."""
+    predicted = (before.points + moves).astype(np.float32)
+    seen = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    maps = losses.distance_maps(predicted, after.points, *seen)
+    flow = optical_flow(before.points, predicted, camera).reshape(before.images.shape[:3] + (2,))
     values = {"chamfer": losses.chamfer_loss(*maps),
-              "distance_smoothness": losses.distance_smoothness_loss(*maps, batch.images, batch.next_images,
-                                                                     batch.shared, batch.next_shared),
-              "photometric": losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared),
-              "flow_smoothness": losses.flow_smoothness_loss(flow, batch.images, batch.valid)}
+              "distance_smoothness": losses.distance_smoothness_loss(*maps, before.images, after.images, *seen),
+              "photometric": losses.photometric_loss(before.images, after.images, flow, seen[0]),
+              "flow_smoothness": losses.flow_smoothness_loss(flow, before.images, before.valid)}
     return {name: training.WEIGHTS[name] * value for name, value in values.items()}
 
 
 def landscape(interactions, truth, count=60):
     """Each term along the scaled true flow, and along a rotation added to it, averaged over pokes of one object."""
     rows = np.array([row for row in range(len(interactions)) if len(moved_labels(truth, row)) == 1][:count])
+    true = np.stack([evaluation.true_motion(interactions, truth, row)[0] for row in rows])
     figure = Figure(figsize=(9, 7), layout="constrained")
     axes = figure.subplots(2, 2, sharey="row")
     scales, angles = np.linspace(-0.5, 2, 26), np.linspace(-60, 60, 25)
     for line, noise in enumerate((0.0, 0.01)):
-        batch = training.make_batch(interactions, rows, depth_noise=noise, rng=np.random.default_rng(0),
-                                    truth=truth[rows])
-        true = batch.targets - batch.points
+        seen = interactions[rows]
+        if noise:
+            seen = with_depth_noise(seen, noise, np.random.default_rng(0))
+        scene, next_scene = training.scenes_of(seen)
         moving = np.linalg.norm(true, axis=2) > 1e-4
-        after = batch.points + true
+        after = scene.points + true
         weight = moving[..., None] / np.maximum(moving.sum(axis=1), 1)[:, None, None]
         centre = (after * weight).sum(axis=1, keepdims=True)
 
         def turned(angle):
             turn = Rotation.from_rotvec([0, 0, np.radians(angle)]).as_matrix()
-            return np.where(moving[..., None], (after - centre) @ turn.T + centre - batch.points, true)
+            return np.where(moving[..., None], (after - centre) @ turn.T + centre - scene.points, true)
         for panel, sweep, flows, label in (
                 (axes[line, 0], scales, [scale * true for scale in scales], "share of the true scene flow"),
                 (axes[line, 1], angles, [turned(angle) for angle in angles], "turn added to the true motion, degrees")):
-            curves = [terms_at(batch, flow, interactions.camera) for flow in flows]
+            curves = [terms_at(scene, next_scene, flow, interactions.camera) for flow in flows]
             for name, colour in COLOURS.items():
                 values = np.array([curve[name].mean() for curve in curves])
                 panel.plot(sweep, values - values.min(), color=colour, label=name.replace("_", " "))
@@ -86,10 +94,9 @@ def gradient_norms(run, interactions, count=40):
     """{term: (norm of the mean gradient, median norm of one poke's)} over some pokes, before weighting."""
     found = {}
     for term in training.WEIGHTS:
-        weights = {name: float(name == term) for name in training.WEIGHTS}
-        batches = (training.make_batch(interactions, np.array([row])) for row in range(count))
-        each = np.stack([training.batch_gradient(run.vector, run.layout, run.recipe.sizes, batch, interactions.camera,
-                                                 weights)[1] for batch in batches])
+        recipe = replace(run.recipe, batch=1, image_noise=0.0, weights={term: 1.0})
+        each = np.stack([training.chunk_gradient(training.unsupervised, run.vector, run.layout, recipe,
+                                                 interactions[[row]], 0)[1] for row in range(count)])
         found[term] = np.linalg.norm(each.mean(axis=0)), np.median(np.linalg.norm(each, axis=1))
     return found
 
@@ -107,17 +114,14 @@ def norms_table(runs, interactions):
 
 def predictions(run, interactions, truth):
     """For every poke that moved something: a dict of what is predicted, what is true, and how large the error is."""
-    for first in range(0, len(interactions), 40):
-        rows = np.arange(first, min(first + 40, len(interactions)))
-        batch, prediction, flow, *_ = evaluation.predict(run, interactions, rows)
-        for i, row in enumerate(rows):
-            true, pixels, moving = evaluation.true_motion(interactions, truth, row)
-            if moving.any():
-                yield {"row": row, "labels": moved_labels(truth, row), "masks": prediction.masks[i], "flow": flow[i],
-                       "softness": 1 - prediction.masks[i][moving, 1:].sum(axis=1).mean(),
-                       "error": ((prediction.points[i] - batch.points[i] - true)[moving] ** 2).sum(),
-                       "motion": (true[moving] ** 2).sum(),
-                       "true": pixels}
+    for row in range(len(interactions)):
+        true, pixels, moving = evaluation.true_motion(interactions, truth, row)
+        if moving.any():
+            answer = evaluation.ask(run, interactions, row)
+            error, masks = answer.prediction.points[0] - answer.before.points[0] - true, answer.prediction.masks[0]
+            yield {"row": row, "labels": moved_labels(truth, row), "masks": masks, "flow": answer.flow,
+                   "softness": 1 - masks[moving, 1:].sum(axis=1).mean(), "error": (error[moving] ** 2).sum(),
+                   "motion": (true[moving] ** 2).sum(), "true": pixels}
 
 
 def draw(examples):
@@ -129,8 +133,7 @@ def draw(examples):
         scale = np.linalg.norm(true, axis=2).max()
         image = data.rgb_before[row] / 255
         show_image(line[0], image, title.capitalize())
-        ends = np.array([[*data.starts[row], 0.02], [*data.pokes[row, :2], 0.02]])
-        draw_arrow(line[0], *project(ends, data.camera))
+        draw_arrow(line[0], *on_table([data.starts[row], data.pokes[row, :2]], data.camera))
         show_image(line[1], blend(image, found["masks"].reshape(*shape, -1)[..., 1:]), "Predicted masks")
         show_image(line[2], flow_to_rgb(found["flow"], scale), "Predicted optical flow")
         show_image(line[3], flow_to_rgb(true, scale), "True optical flow, same colours")
@@ -145,7 +148,7 @@ def turn_of(truth, row, label):
 
 def failures(run, interactions, truth):
     """The worst poke of each kind: a second object hit, a wall met, a soft mask, a turn missed."""
-    half, worst = interactions.meta["settings"]["arena"] / 2, {}
+    half, worst = interactions.settings["arena"] / 2, {}
     for found in predictions(run, interactions, truth):
         row, labels = found["row"], found["labels"]
         at_wall = np.abs(truth.poses_after[row, labels - 1, :2]).max(initial=0) > half - 0.045
@@ -163,7 +166,7 @@ def emergent(run, interactions, truth, pokes=120):
     """Pokes never seen, of objects seen and of kinds and textures never seen: the median one and the quartiles."""
     examples = []
     with tempfile.TemporaryDirectory() as folder:
-        collect(Path(folder), pokes, 102, Settings(**HELD_OUT), jobs=2)
+        collect(Path(folder), pokes, 102, Settings(**HELD_OUT))
         unseen = load_interactions(folder), load_truth(folder)
     for name, (data, labels) in (("known kinds", (interactions, truth)), ("new kinds", unseen)):
         found = [each for each in predictions(run, data, labels) if each["motion"] > 0.03]  # m^2: well moved

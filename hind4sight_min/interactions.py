@@ -1,19 +1,17 @@
-"""The record of one poke, shards of them on disk, and the paper's two noise models.
+"""The record of one poke, shards of them on disk, and the arena's grid of cells.
 
-A data set is a folder of shards `shard_0000.npz`, each describing itself (camera, units, seed, simulator
-settings, format version), and beside each a `shard_0000.truth.npz` with what the simulator knows but
-the robot does not see. Training reads only the former; evaluation also reads the latter.
+A data set is a folder of shards `shard_0000.npz`, each describing itself (camera, units, seed, simulator settings,
+format version). Beside each lies a `shard_0000.truth.npz` with what the simulator knows and the robot does not see:
+that is read by sim/truth.py, which no file here imports.
 """
-import json
-import os
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from .geometry import Camera, unproject
+from .files import load_npz, save_npz
+from .geometry import Camera
 
 FORMAT = "hind4sight_min interactions 1"
 DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
@@ -26,7 +24,9 @@ class Interactions:
     rgb_before, rgb_after: (M, H, W, 3) uint8. depth_before, depth_after: (M, H, W) float32 m, 0 = missing.
     pokes: (M, 3) float32, u = (a_x, a_y, a_theta): target on the arena plane in m, direction in rad.
     starts: (M, 2) float32 m, where the finger came down. empty_depth: (H, W) float32 m, the empty arena.
-    camera: the camera of this image size. meta: settings, seed, counts (plain JSON types).
+    camera: the camera of this image size. meta: settings, seed, counts (plain JSON types); meta["settings"] has the
+    side of the "arena" and of a "cell" in m.
+    Raises ValueError naming the field whose shape, type or values are not these.
     """
     rgb_before: np.ndarray
     rgb_after: np.ndarray
@@ -40,8 +40,8 @@ class Interactions:
 
     def __post_init__(self):
         count, size = len(self.pokes), (self.camera.height, self.camera.width)
-        settings = self.meta.get("settings")
         for name in ("arena", "cell"):
+            settings = self.meta.get("settings")
             if not (isinstance(settings, dict) and 0 < settings.get(name, 0) < float("inf")):
                 raise ValueError(f"meta: expected settings with a positive {name!r} in m")
         expected = {"rgb_before": (count, *size, 3), "rgb_after": (count, *size, 3),
@@ -65,95 +65,22 @@ class Interactions:
         """The interactions at `rows` (a slice or an index array), same camera and meta."""
         if np.ndim(rows) == 0 and not isinstance(rows, slice):
             raise TypeError(f"rows: expected a slice or an index array, got {rows!r}")
-        picked = {name: getattr(self, name)[rows] for name in
-                  ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")}
+        picked = {name: getattr(self, name)[rows] for name in PER_POKE}
         return Interactions(**picked, empty_depth=self.empty_depth, camera=self.camera, meta=self.meta)
 
     @property
-    def grid_shape(self):
-        """(rows, columns) of the arena's grid of cells; rows run along y, columns along x."""
-        return grid_shape(self.meta["settings"])
+    def settings(self):
+        """The settings of the arena these pokes were made in, as the simulator's Settings: a dict."""
+        return self.meta["settings"]
 
 
-@dataclass
-class Truth:
-    """What the simulator knows of M pokes. For evaluation (and the supervised baseline) only.
-
-    labels: (M, H, W) uint8 before the poke, 0 = background, i + 1 = object i.
-    poses_before, poses_after: (M, 7, 7) float32, arena, per object (x, y, z, qx, qy, qz, qw); unused rows 0.
-    """
-    labels: np.ndarray
-    poses_before: np.ndarray
-    poses_after: np.ndarray
-
-    def __getitem__(self, rows):
-        return Truth(self.labels[rows], self.poses_before[rows], self.poses_after[rows])
+PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
 
 
-def points_and_validity(depth, camera):
-    """Depth (..., H, W) m -> points (..., H, W, 3) m in the arena frame, and validity (..., H, W) bool."""
-    return unproject(depth, camera), depth > 0
-
-
-OCCUPIED = 0.008  # m: background subtraction takes what is nearer than the empty arena by more for an object
-
-
-def occupied_pixels(depth, empty_depth, threshold=OCCUPIED):
-    """Background subtraction: (..., H, W) bool, where something stands in the arena. Paper: Sec. IV-A.
-
-    depth, empty_depth (..., H, W) m. A pixel counts when it is nearer than the empty arena by more than `threshold` m.
-    """
-    return (depth > 0) & (empty_depth > 0) & (empty_depth - depth > threshold)
-
-
-def prominence(depth, empty_depth):
-    """How far the highest of each pixel and its eight neighbours stands out: (..., H, W) m, 0 where there is no depth.
-
-    depth, empty_depth (..., H, W) m. What stands out is nearer than the empty arena. Not in the paper: with the
-    neighbours the rims of objects, and the table next to them, stand out as well.
-    """
-    rise = np.where((depth > 0) & (empty_depth > 0), empty_depth - depth, 0).astype(np.float32)
-    around = np.ones((3, 3), np.uint8)
-    return np.reshape([cv2.dilate(each, around) for each in rise.reshape(-1, *depth.shape[-2:])], depth.shape)
-
-
-def standing(depth, empty_depth, camera, settings, threshold=OCCUPIED):
-    """The picture's points (..., H, W, 3) m, arena, and which of them are of something that stands inside the walls,
-    (..., H, W) bool: `occupied_pixels`, less the walls.
-    """
-    points = unproject(depth, camera)
-    inside = np.abs(points[..., :2]).max(axis=-1) < settings["arena"] / 2
-    return points, inside & occupied_pixels(depth, empty_depth, threshold)
-
-
-def rotation_from_quaternion(quaternions):
-    """Unit quaternions (..., 4), (x, y, z, w) as in Bullet -> rotation matrices (..., 3, 3)."""
-    x, y, z, w = np.moveaxis(np.asarray(quaternions, float), -1, 0)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
-    return np.stack(rows, axis=-1).reshape(x.shape + (3, 3))
-
-
-def true_scene_flow(points, labels, pose_before, pose_after):
-    """Scene flow of one interaction from the objects' poses. Paper: Sec. IV-C.
-
-    flow = R_a R_b^T (p - t_b) + t_a - p  for a point p on an object, 0 on the background.
-    points (H, W, 3) m arena, labels (H, W), poses (7, 7) -> (H, W, 3) float32 m.
-    """
-    flow = np.zeros(points.shape, np.float32)
-    before, after = (rotation_from_quaternion(pose[:, 3:]) for pose in (pose_before, pose_after))
-    for index in np.unique(labels[labels > 0]) - 1:
-        here = labels == index + 1
-        local = (points[here] - pose_before[index, :3]) @ before[index]
-        flow[here] = local @ after[index].T + pose_after[index, :3] - points[here]
-    return flow
-
-
-# --- the arena's grid ------------------------------------------------------------------------------
+# --- the arena's grid of cells: heat-maps live on it, and pokes are drawn on it ----------------------------------
 
 def grid_shape(settings):
-    """(rows, columns) of the arena's grid of cells, from the simulator's settings."""
+    """(rows, columns) of the arena's grid of cells; rows run along y, columns along x."""
     cells = int(round(settings["arena"] / settings["cell"]))
     return cells, cells
 
@@ -173,153 +100,43 @@ def cell_centres(settings):
     return (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) * settings["cell"] - settings["arena"] / 2
 
 
-# --- the paper's two noises (Sec. IV-B) --------------------------------------------------------------
+def occupied_grid(clouds, occupied, settings):
+    """Which cells objects stand in. Paper: Sec. IV-A.
 
-def add_depth_noise(depth, rng, standard_deviation=0.01):
-    """Gaussian depth noise that grows with depth. Paper: Sec. IV-B, "SD of 1 cm, scaled by the depth".
-
-    The SD is `standard_deviation` metres at each picture's median depth, and proportional to depth.
-    depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing.
+    clouds (J, N, 3) m, arena; occupied (N,) bool: points of objects -> (J, rows, columns) bool.
     """
-    if not 0 <= standard_deviation < float("inf"):
-        raise ValueError(f"standard_deviation: expected a number of metres >= 0, got {standard_deviation}")
-    valid = depth > 0
-    pictures = depth.reshape(-1, *depth.shape[-2:])
-    median = np.array([np.median(each[each > 0]) if each.any() else 1.0 for each in pictures], depth.dtype)
-    scale = standard_deviation / median.reshape(depth.shape[:-2] + (1, 1))
-    noisy = depth * (1 + scale * rng.standard_normal(depth.shape))
-    return np.where(valid, np.maximum(noisy, DEPTH_UNIT), 0).astype(depth.dtype)
+    grid = np.zeros((len(clouds), *grid_shape(settings)), bool)
+    cells = cells_of(clouds[:, occupied, :2], settings)
+    grid.reshape(len(clouds), -1)[np.arange(len(clouds))[:, None], cells] = True
+    return grid
 
 
-SMOOTHING = 3, 3.0, 0.15, 0.02  # radius in px, and what counts as near: SDs in px, of colours in [0, 1], in m
+def with_neighbours(grid):
+    """The cells of grids (J, rows, columns) bool and their eight neighbours each."""
+    return np.stack([cv2.dilate(each.astype(np.uint8), np.ones((3, 3), np.uint8)) for each in grid]) > 0
 
 
-def smooth_depth(depth, empty_depth, images):
-    """Take noise out of depth pictures with the help of the colours: a joint bilateral filter. Not in the paper.
+def finger_fits(places, grid, settings):
+    """Where the finger may come down: not on or next to an occupied cell, and clear of the walls. Paper: Sec. IV-A.
 
-    In the difference to the empty arena the table is flat at 0 and objects are islands some cm high. There each pixel
-    becomes a mean of those around it, weighted by how near they are: in the picture, in colour, and in a first guess of
-    the difference, a bilateral filter of it alone. Of 1 cm of noise that leaves 2 mm on the table and 7 on objects.
-    depth (..., H, W) m, 0 = missing, which stays and counts for nobody; empty_depth (..., H, W) m, complete;
-    images (..., H, W, 3) uint8 -> the shape and dtype of depth.
+    places (J, L, 2) m on the arena plane; grid (J, rows, columns) bool, occupied cells -> (J, L) bool.
     """
-    radius, px, colour, metres = SMOOTHING
-    height, width = depth.shape[-2:]
-    seen = (depth > 0).astype(np.float32).reshape(-1, height, width)
-    difference = seen * (depth - empty_depth).astype(np.float32).reshape(seen.shape)
-    guess = np.stack([cv2.bilateralFilter(each, 5, 0.025, 1.5) for each in difference]) / np.float32(metres)
-    red_green_blue = np.moveaxis(images.reshape(-1, height, width, 3), -1, 0) / np.float32(255 * colour)
-    # With a rim, where nothing is seen, a shift is an offset in flat arrays: twice as fast.
-    rim = (0, 0), (0, radius), (0, radius)
-    seen, difference, *guides = (np.pad(each, rim).ravel() for each in (seen, difference, guess, *red_green_blue))
-    total, weight = difference.copy(), seen.copy()
-    for dv in range(radius + 1):
-        for du in range(-radius if dv else 1, radius + 1):  # each pair of pixels once, for both
-            offset = dv * (width + radius) + du
-            here, there = slice(None, -offset), slice(offset, None)
-            apart = np.float32((dv ** 2 + du ** 2) / px ** 2)  # squared, in standard deviations
-            for guide in guides:
-                apart = apart + np.square(guide[here] - guide[there])
-            near = np.exp(-apart / 2)
-            total[here] += near * difference[there]
-            total[there] += near * difference[here]
-            weight[here] += near * seen[there]
-            weight[there] += near * seen[here]
-    smooth = (total / np.maximum(weight, 1e-6)).reshape(-1, height + radius, width + radius)[:, :height, :width]
-    return np.where(depth > 0, empty_depth + smooth.reshape(depth.shape), 0).astype(depth.dtype)
+    taken = with_neighbours(grid).reshape(len(grid), -1)
+    inside = np.abs(places).max(axis=2) < settings["arena"] / 2 - settings["finger_radius"]
+    return inside & ~taken[np.arange(len(grid))[:, None], cells_of(places, settings)]
 
 
-def associate_with_noise(depth, rng, window, threshold=0.10):
-    """Spurious data association: each pixel is taken for another one near it. Paper: Sec. IV-B.
+# --- shards on disk -----------------------------------------------------------------------------------
 
-    Every pixel draws one pixel of the window x window square around it; the draw counts if it lies in the
-    picture, has depth, and differs in depth by at most `threshold` metres; otherwise the pixel keeps itself.
-    depth (H, W) m -> (H, W) int: the flat index each pixel is associated with.
-    """
-    if window < 1 or window % 2 == 0:
-        raise ValueError(f"window: expected an odd number of pixels >= 1, got {window}")
-    height, width = depth.shape
-    v, u = np.mgrid[:height, :width]
-    shift = rng.integers(-(window // 2), window // 2 + 1, size=(2, height, width))
-    v_new, u_new = v + shift[0], u + shift[1]
-    inside = (v_new >= 0) & (v_new < height) & (u_new >= 0) & (u_new < width)
-    v_new, u_new = np.where(inside, v_new, v), np.where(inside, u_new, u)
-    other = depth[v_new, u_new]
-    good = (other > 0) & (depth > 0) & (np.abs(other - depth) <= threshold)
-    return np.where(good, v_new * width + u_new, v * width + u)
-
-
-# --- files -------------------------------------------------------------------------------------------
-
-@contextmanager
-def whole_file(path):
-    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # the ending stays: libraries go by it
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_text(path, text):
-    """Write a text file, whole or not at all."""
-    with whole_file(path) as temporary:
-        temporary.write_text(text)
-
-
-def write_json(path, figures):
-    """Write plain JSON types, whole or not at all; nothing for no path."""
-    if path:
-        write_text(path, json.dumps(figures, indent=2, sort_keys=True) + "\n")
-
-
-def save_npz(path, arrays, meta):
-    """Write arrays and one JSON text to a compressed .npz, whole or not at all."""
-    with whole_file(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, meta=np.array(json.dumps(meta, sort_keys=True)), **arrays)
-
-
-def load_npz(path, format):
-    """Read what `save_npz` wrote: (dict of arrays, meta). Raises ValueError naming the file if it is damaged."""
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        meta = dict(json.loads(str(arrays.pop("meta"))))
-    except MemoryError:
-        raise
-    except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, NumPy, JSON
-        raise ValueError(f"{path}: damaged or not one of our files ({error or type(error).__name__})") from None
-    if meta.get("format") != format:
-        raise ValueError(f"{path}: expected format {format!r}, got {meta.get('format')!r}")
-    return arrays, meta
-
-
-def truth_path(shard):
-    """The truth file that belongs to a shard."""
-    return Path(shard).with_suffix("").with_suffix(".truth.npz")
-
-
-def save_shard(path, interactions, truth):
-    """Write one shard and its truth file (each whole or not at all; the truth first, so a shard has one)."""
+def save_shard(path, interactions):
+    """Write one shard, whole or not at all."""
     meta = {**interactions.meta, "format": FORMAT, "camera": asdict(interactions.camera),
             "units": {"depth": DEPTH_UNIT, "pokes": "m, m, rad", "starts": "m"}}
     meta["camera"]["arena_from_camera"] = interactions.camera.arena_from_camera.tolist()
-
-    def counts(depth):
-        return np.clip(np.round(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-
-    save_npz(truth_path(path), {"labels": truth.labels, "poses_before": truth.poses_before,
-                                "poses_after": truth.poses_after}, {"format": FORMAT})
-    save_npz(path, {"rgb_before": interactions.rgb_before, "rgb_after": interactions.rgb_after,
-                    "depth_before": counts(interactions.depth_before), "depth_after": counts(interactions.depth_after),
-                    "pokes": interactions.pokes, "starts": interactions.starts,
-                    "empty_depth": counts(interactions.empty_depth)}, meta)
+    arrays = {name: getattr(interactions, name) for name in (*PER_POKE, "empty_depth")}
+    for name in ("depth_before", "depth_after", "empty_depth"):
+        arrays[name] = np.clip(np.round(arrays[name] / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+    save_npz(path, arrays, meta)
 
 
 def load_shard(path):
@@ -351,29 +168,13 @@ def shards_in(folder):
 
 def load_interactions(folder):
     """All shards of a folder, joined -> Interactions. They must share camera, arena and grid."""
-    parts = [load_shard(path) for path in shards_in(folder)]
+    paths = shards_in(folder)
+    parts = [load_shard(path) for path in paths]
     first = parts[0]
-    for path, part in zip(shards_in(folder), parts):
-        same = all(part.meta["settings"][name] == first.meta["settings"][name] for name in ("arena", "cell"))
+    for path, part in zip(paths, parts):
+        same = all(part.settings[name] == first.settings[name] for name in ("arena", "cell"))
         if (part.meta["camera"] != first.meta["camera"] or not same
                 or not np.array_equal(part.empty_depth, first.empty_depth)):
             raise ValueError(f"{path}: another camera, arena or grid than the folder's first shard")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in
-              ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")}
-    return Interactions(**joined, empty_depth=parts[0].empty_depth, camera=parts[0].camera, meta=parts[0].meta)
-
-
-def load_truth(folder):
-    """The truth of all shards of a folder, joined -> Truth, in the order of `load_interactions`."""
-    parts = []
-    for shard in shards_in(folder):
-        path, pictures = truth_path(shard), load_shard(shard).depth_before.shape
-        part, _ = load_npz(path, FORMAT)
-        poses = (pictures[0], 7, 7)
-        for name, shape in (("labels", pictures), ("poses_before", poses), ("poses_after", poses)):
-            found = part[name].shape if name in part else "nothing"
-            if found != shape:
-                raise ValueError(f"{path}: {name}: expected shape {shape}, got {found}")
-        parts.append(part)
-    return Truth(*(np.concatenate([part[name] for part in parts])
-                   for name in ("labels", "poses_before", "poses_after")))
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POKE}
+    return Interactions(**joined, empty_depth=first.empty_depth, camera=first.camera, meta=first.meta)

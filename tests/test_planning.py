@@ -1,244 +1,138 @@
-from dataclasses import asdict, replace
+"""Sec. III-H and IV-G: the one model that plans, legal pokes, rollouts, the cost, CEM."""
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiny import SETTINGS, TINY, camera, random_run, tiny_pokes
 
-from hind4sight_min import evaluation, planning, training
-from hind4sight_min.__main__ import data_small
+from hind4sight_min import planning
 from hind4sight_min.geometry import project
-from hind4sight_min.interactions import cell_centres, load_interactions, load_truth, true_scene_flow
-from hind4sight_min.planning import Goal, Search, View
-from hind4sight_min.simulator import Settings, arena_camera, occupied_cells
+from hind4sight_min.interactions import cell_centres, finger_fits, occupied_grid
+from hind4sight_min.lab import evaluation
+from hind4sight_min.planning import Goal, Search, View, cem, draw_pokes, plan, planning_cost, possible_starts, roll
+from hind4sight_min.scene import Scene
+from hind4sight_min.training import scenes_of
 
-SETTINGS = asdict(Settings())
-CAMERA = arena_camera(64, 48)
-
-
-@pytest.fixture(scope="module")
-def pokes():
-    return load_interactions(data_small() / "test"), load_truth(data_small() / "test")
+CAMERA = camera(64, 48, 77.0)
 
 
-@pytest.fixture(scope="module")
-def run():
-    return training.load_run(data_small() / "checkpoint.npz")
-
-
-def view_of_row(interactions, row, marks=()):
-    return planning.view_of(interactions.depth_before[row], interactions.empty_depth, interactions.camera,
-                            interactions.meta["settings"], np.float32(marks).reshape(-1, 3))
-
-
-def island(count=20, seed=0):
-    """A View of one small object at (0, 0) with a mark on it, and nothing else."""
+def island(count=20, seed=0, marks=((0, 0, 0.03),), table=()):
+    """A View of one small object at (0, 0) with marks on it, and perhaps points of the table."""
     points = np.random.default_rng(seed).uniform([-0.01, -0.01, 0.02], [0.01, 0.01, 0.03], (count, 3))
-    cloud = np.float32(np.vstack([points, [[0, 0, 0.03]]]))
-    return View(cloud, np.ones(count + 1, bool), np.ones(count + 1, bool), cloud[:, 2], 1)
+    cloud = np.vstack([np.reshape(table, (-1, 3)), points, marks]).astype(np.float32)[None]
+    on = np.arange(cloud.shape[1])[None] >= len(table)
+    return View(Scene(cloud, np.ones_like(on), on, on), len(marks))
 
 
-# --- CEM ------------------------------------------------------------------------------------------------------
+# --- the model ----------------------------------------------------------------------------------------------------
 
-def test_refit_against_numpy_and_on_the_circle():
-    rng = np.random.default_rng(0)
-    elites = rng.normal([0.1, -0.1, 0.5], [0.02, 0.03, 0.2], (50, 2, 3))
-    mean, deviation = planning.refit(elites)
-    np.testing.assert_allclose(mean[:, :2], elites[..., :2].mean(axis=0))
-    np.testing.assert_allclose(deviation[:, :2], elites[..., :2].std(axis=0))
-    np.testing.assert_allclose(mean[:, 2], elites[..., 2].mean(axis=0), atol=0.01)
-    elites[..., 2] = np.where(np.arange(50) % 2, np.pi - 0.1, -np.pi + 0.1)[:, None]  # both sides of the seam
-    mean, deviation = planning.refit(elites)
-    np.testing.assert_allclose(np.abs(mean[:, 2]), np.pi, atol=1e-9)
-    np.testing.assert_allclose(deviation[:, 2], 0.1)
-    np.testing.assert_allclose(planning.refit(elites[:1])[1], np.tile(planning.LEAST, (2, 1)))  # never quite narrow
-
-
-def bowl(sequences):
-    """Lowest at (0.03, -0.05, pi): on the seam of the circle."""
-    x, y, angle = np.moveaxis(sequences[:, 0].astype(float), -1, 0)
-    return (x - 0.03) ** 2 + (y + 0.05) ** 2 + 0.01 * (1 + np.cos(angle))
+def test_planning_predicts_exactly_what_was_evaluated():
+    data = tiny_pokes(cam=CAMERA)
+    run = random_run(TINY, data=data)
+    for row in range(3):
+        answer = evaluation.ask(run, data, row)
+        marks = answer.before.points[0][answer.before.occupied[0]][:1]
+        view = planning.view_of(answer.before, marks[:0])
+        moved = planning.learned_step(run, view)(view.cloud[None], data.pokes[[row]])
+        np.testing.assert_array_equal(moved[0], answer.prediction.points[0])
+        assert np.abs(moved[0] - view.cloud).max() > 1e-3
+        marked = planning.view_of(answer.before, marks)
+        again = planning.learned_step(run, marked)(marked.cloud[None], data.pokes[[row]])
+        assert np.abs(again[0, -1] - marks).max() > 1e-4  # a mark moves with its object
 
 
-def first_population(rng, count=100):
-    return rng.uniform([-0.2, -0.2, -np.pi], [0.2, 0.2, np.pi], (count, 1, 3)).astype(np.float32)
+def test_many_candidates_are_predicted_as_each_alone(monkeypatch):
+    data = tiny_pokes(cam=CAMERA)
+    run, (scene, _) = random_run(TINY, data=data), scenes_of(data[[2]])
+    view = planning.view_of(scene, scene.points[0][scene.occupied[0]][:2])
+    pokes = np.repeat(data.pokes[[2]], 5, axis=0) + np.linspace(0, 0.04, 5, dtype=np.float32)[:, None]
+    monkeypatch.setattr(planning, "CHUNK", 2)
+    step = planning.learned_step(run, view)
+    together = step(np.repeat(view.cloud[None], 5, axis=0), pokes)
+    for found, poke in zip(together, pokes):
+        np.testing.assert_allclose(found, step(view.cloud[None], poke[None])[0], atol=1e-6)
+    assert np.abs(together[0] - together[4]).max() > 1e-3
 
 
-def test_cem_finds_the_minimum_of_a_bowl_where_a_part_is_forbidden():
-    rng, seen = np.random.default_rng(1), []
-
-    def cost(sequences):
-        return np.where(sequences[:, 0, 0] > 0.1, np.nan, bowl(sequences))
-    best, lowest = planning.cem(cost, first_population(rng), rng, Search(candidates=100, elites=10, iterations=12),
-                                lambda *state: seen.append(state))
-    np.testing.assert_allclose(best[0, :2], [0.03, -0.05], atol=0.006)
-    assert abs(abs(best[0, 2]) - np.pi) < 0.1
-    assert lowest == bowl(best[None])[0]
-    assert [state[0] for state in seen] == list(range(12))
-    assert all(state[2].shape == (100,) and not np.isnan(state[2]).any() for state in seen)
-    assert np.isinf(seen[0][2]).any()
-    assert (np.diff([state[4][0, 0] for state in seen[:4]]) < 0).all()  # the Gaussian narrows
+def test_a_cloud_that_moved_is_looked_at_where_it_is_now():
+    data = tiny_pokes(cam=CAMERA)
+    run, (scene, _) = random_run(TINY, data=data), scenes_of(data[[2]])
+    view = planning.view_of(scene, scene.points[0][:0])
+    away = view.cloud[None] + np.float32([[[0.5, 0, 0]]]) * view.occupied[None, :, None]
+    moved = planning.learned_step(run, view)(away, data.pokes[[2]])
+    np.testing.assert_array_equal(moved[0][view.occupied], away[0][view.occupied])
 
 
-def test_cem_keeps_the_best_ever_seen():
-    rng, found = np.random.default_rng(2), []
-
-    def cost(sequences):  # from the second round on everything new is worse
-        found.append(bowl(sequences) if not found else bowl(sequences) + 1)
-        return found[-1]
-    best, lowest = planning.cem(cost, first_population(rng), rng, Search(iterations=4))
-    assert lowest == found[0].min() and bowl(best[None])[0] == lowest
-
-
-def test_every_round_starts_with_the_best_so_far():
-    rng, seen = np.random.default_rng(2), []
-    planning.cem(bowl, first_population(rng), rng, Search(iterations=5), lambda *state: seen.append(state))
-    best, lowest = None, np.inf
-    for _, population, costs, *_ in seen:
-        if best is not None:
-            np.testing.assert_array_equal(population[0], best)
-        if costs.min() < lowest:
-            best, lowest = population[costs.argmin()].copy(), costs.min()
-
-
-def test_cem_with_fewer_possible_candidates_than_elites_and_with_none():
-    rng, population = np.random.default_rng(3), first_population(np.random.default_rng(4))
-    only = population[7].copy()
-
-    def cost(sequences):
-        return np.where((sequences == only).all(axis=(1, 2)), 1.0, np.inf)
-    best, lowest = planning.cem(cost, population, rng, Search(iterations=3))
-    np.testing.assert_array_equal(best, only)
-    assert lowest == 1
-    with pytest.raises(ValueError, match="no candidate poke is possible"):
-        planning.cem(lambda s: np.full(len(s), np.nan), population, rng, Search())
-
-
-@pytest.mark.parametrize("changes, named", [
-    (dict(candidates=0), "candidates"), (dict(elites=65), "elites"), (dict(iterations=0), "iterations"),
-    (dict(horizon=0), "horizon"), (dict(pixel_weight=-1.0), "pixel_weight"),
-    (dict(pixel_weight=0.0, chamfer_weight=0.0), "chamfer_weight")])
-def test_search_that_cannot_be(changes, named):
-    with pytest.raises(ValueError, match=named):
-        Search(**changes)
-
-
-# --- what the robot sees --------------------------------------------------------------------------------------
-
-def test_standing_and_the_grid_agree_with_the_simulators_background_subtraction(pokes):
-    interactions, _ = pokes
-    for row in (0, 17, 49):
-        view = view_of_row(interactions, row)
-        grid = planning.occupied_grid(view.cloud[None], view.occupied, SETTINGS)[0]
-        depth, camera = interactions.depth_before[row], interactions.camera
-        expected = occupied_cells(depth, interactions.empty_depth, camera, SETTINGS)
-        np.testing.assert_array_equal(grid, expected)
-        assert 10 < grid.sum() < 100
-
-
-def test_marks_become_points_and_pixels_become_places(pokes):
-    interactions, truth = pokes
-    rows, columns = np.nonzero(truth.labels[0] == 1)
-    marks = np.column_stack([columns, rows])[:3]
-    arguments = interactions.depth_before[0], interactions.empty_depth, interactions.camera, SETTINGS
-    points = planning.points_at(marks, *arguments)
-    np.testing.assert_allclose(project(points, interactions.camera), marks, atol=1e-3)
-    places = planning.places_at(marks, points[:, 2], interactions.camera, SETTINGS)
-    np.testing.assert_allclose(places, points[:, :2], atol=1e-5)
-    for wrong, said in (([(64, 3)], "outside the 64 x 48"), ([(np.nan, 3)], "outside"), ([(0, 47)], "background"),
-                        ([], "at least one"), ([1, 2], "expected")):
-        with pytest.raises(ValueError, match=said):
-            planning.points_at(wrong, *arguments)
-    for wrong, said in (([(70, 3)], "outside the 64 x 48"), ([(0, 47)], "outside the walls"),
-                        ([(1, 2, 3)], "one per mark")):
-        with pytest.raises(ValueError, match=said):
-            planning.places_at(wrong, [0.03], interactions.camera, SETTINGS)
-
-
-def test_empty_scenes_are_refused(pokes):
-    interactions, _ = pokes
-    empty = interactions.empty_depth
-    with pytest.raises(ValueError, match="scene: no object"):
-        planning.view_of(empty, empty, interactions.camera, SETTINGS, np.zeros((0, 3), np.float32))
+def test_empty_scenes_are_refused():
+    scene, _ = scenes_of(tiny_pokes()[[0]])
+    empty = replace(scene, occupied=np.zeros_like(scene.occupied))
+    with pytest.raises(planning.NoPoke, match="scene: no object"):
+        planning.view_of(empty, np.zeros((0, 3), np.float32))
     with pytest.raises(ValueError, match="goal scene: no object"):
-        planning.goal_of([(3, 3)], interactions.camera, SETTINGS, empty, empty)
+        planning.goal_of([(3, 3)], empty)
 
 
-def test_a_checkpoint_of_another_camera_is_refused(run):
-    training.check_camera(run, CAMERA)
-    with pytest.raises(ValueError, match="another camera"):
-        training.check_camera(run, replace(CAMERA, fx=CAMERA.fx + 1))
-
-
-# --- actions --------------------------------------------------------------------------------------------------
+# --- legal pokes ------------------------------------------------------------------------------------------------------
 
 def test_possible_starts_against_a_loop():
     rng = np.random.default_rng(5)
-    grid = rng.random((40, 20, 20)) < 0.04
-    pokes = np.column_stack([rng.uniform(-0.26, 0.26, (40, 2)), rng.uniform(-np.pi, np.pi, 40)])
-    found = planning.possible_starts(pokes, grid, SETTINGS, lengths=3)
-    counted = 0
+    grid = rng.random((60, 20, 20)) < 0.04
+    pokes = np.column_stack([rng.uniform(-0.26, 0.26, (60, 2)), rng.uniform(-np.pi, np.pi, 60)])
+    found, possible_ones, at_rim = possible_starts(pokes, grid, SETTINGS, lengths=3), 0, 0
     for j, (x, y, angle) in enumerate(pokes):
         def near(px, py):
             column, row = (min(max(int(np.floor((v + 0.25) / 0.025)), 0), 19) for v in (px, py))
             return grid[j, max(row - 1, 0):row + 2, max(column - 1, 0):column + 2].any()
         for length, start in zip((0.10, 0.12, 0.14), found[j]):
             px, py = x - length * np.cos(angle), y - length * np.sin(angle)
-            possible = (max(abs(px), abs(py)) < 0.24 and max(abs(x), abs(y)) < 0.25 and near(x, y) and not near(px, py))
+            reach = max(abs(px), abs(py))
+            possible = reach < 0.24 and max(abs(x), abs(y)) < 0.25 and near(x, y) and not near(px, py)
+            at_rim += 0.24 < reach < 0.25
             assert np.isfinite(start).all() == possible
             if possible:
                 np.testing.assert_allclose(start, [px, py])
-                counted += 1
-    assert counted > 10
-    first = planning.first_start(found)
-    for row, options in zip(first, found):
+                possible_ones += 1
+    assert possible_ones > 15 and at_rim > 2
+    for row, options in zip(planning.first_start(found), found):
         options = options[np.isfinite(options[:, 0])]
         assert np.isnan(row).all() if not len(options) else (row == options[0]).all()
 
 
-def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere(pokes):
-    interactions, _ = pokes
-    view = view_of_row(interactions, 3)
-    drawn = planning.draw_pokes(np.random.default_rng(6), 300, view, SETTINGS, horizon=2)
+def test_the_finger_keeps_its_radius_from_a_wall():
+    places = np.array([[[0.0, 0.239], [0.0, 0.241], [-0.241, 0.1], [0.24999, 0.24999]]])
+    fits = finger_fits(places, np.zeros((1, 20, 20), bool), SETTINGS)
+    np.testing.assert_array_equal(fits, [[True, False, False, False]], err_msg="within the finger's radius of a wall")
+
+
+def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere():
+    scene, _ = scenes_of(tiny_pokes(cam=CAMERA)[[3]])
+    view = planning.view_of(scene, scene.points[0][:0])
+    drawn = draw_pokes(np.random.default_rng(6), 300, view, SETTINGS, horizon=2)
     assert drawn.shape == (300, 2, 3)
-    grid = planning.occupied_grid(view.cloud[None], view.occupied, SETTINGS)
+    grid = occupied_grid(view.cloud[None], view.occupied, SETTINGS)
     occupied = cell_centres(SETTINGS)[np.flatnonzero(grid[0])]
-    away = np.abs(drawn[..., None, :2] - occupied).max(axis=-1).min(axis=-1)
-    assert away.max() < 0.0126
-    starts = planning.possible_starts(drawn[:, 0], np.repeat(grid, 300, axis=0), SETTINGS)
+    assert np.abs(drawn[..., None, :2] - occupied).max(axis=-1).min(axis=-1).max() < 0.0126
+    starts = possible_starts(drawn[:, 0], np.repeat(grid, 300, axis=0), SETTINGS)
     assert np.isfinite(starts[..., 0]).any(axis=1).all()
-    assert np.histogram(drawn[..., 2], bins=6, range=(-np.pi, np.pi))[0].min() > 30
+    assert np.histogram(drawn[..., 1, 2], bins=6, range=(-np.pi, np.pi))[0].min() > 25
 
 
 def test_no_room_behind_any_object_is_said():
     x, y = np.meshgrid(np.arange(-0.24, 0.25, 0.02), np.arange(-0.24, 0.25, 0.02))
-    cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]).astype(np.float32)
-    full = View(cloud, np.ones(len(cloud), bool), np.ones(len(cloud), bool), cloud[:, 2], 0)
-    with pytest.raises(ValueError, match="no room for the finger"):
-        planning.draw_pokes(np.random.default_rng(7), 10, full, SETTINGS)
+    full = island(marks=np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]))
+    with pytest.raises(planning.NoPoke, match="no room for the finger"):
+        draw_pokes(np.random.default_rng(7), 10, full, SETTINGS)
 
 
-# --- rollouts -------------------------------------------------------------------------------------------------
-
-def test_predict_is_the_model_that_was_evaluated(pokes, run):
-    # On the cloud of a picture the points given to the model are the most prominent ones of its window.
-    interactions, _ = pokes
-    for row in (1, 5, 30):
-        batch, prediction, *_ = evaluation.predict(run, interactions, np.array([row]))
-        view = view_of_row(interactions, row)
-        camera, poke = interactions.camera, interactions.pokes[[row]]
-        moved, masks = planning.predict(run, camera, view, view.cloud[None], poke)
-        np.testing.assert_allclose(moved[0], prediction.points[0], atol=2e-4)
-        assert np.abs(moved[0] - view.cloud).max() > 0.01
-        assert np.mean(masks[0] == prediction.masks[0].argmax(axis=1)) > 0.999
-
+# --- rollouts -----------------------------------------------------------------------------------------------------
 
 def test_rolling_carries_the_cloud_from_poke_to_poke():
-    view, settings = island(), SETTINGS
+    view = island()
 
     def step(clouds, pokes):  # everything moves half-way to the target
-        target = np.column_stack([pokes[:, :2], np.full(len(pokes), 0.025)])
-        return (clouds + target[:, None]) / 2
+        return (clouds + np.column_stack([pokes[:, :2], np.full(len(pokes), 0.025)])[:, None]) / 2
     sequences = np.float32([[[0.01, 0, 0.3], [0.01, 0.005, 2.0]], [[0.01, 0, 0.3], [0.2, 0.2, 0.0]]])
-    clouds, starts = planning.roll(step, view, sequences, settings)
+    clouds, starts = roll(step, view, sequences, SETTINGS)
     first = (view.cloud + [0.01, 0, 0.025]) / 2
     np.testing.assert_allclose(clouds[:, 0], [first, first], atol=1e-6)
     np.testing.assert_allclose(clouds[0, 1], (first + [0.01, 0.005, 0.025]) / 2, atol=1e-6)
@@ -246,11 +140,10 @@ def test_rolling_carries_the_cloud_from_poke_to_poke():
     assert np.isfinite(starts[0]).all() and np.isnan(starts[1, 1]).all()  # there is nothing at (0.2, 0.2)
 
 
-# --- the cost -------------------------------------------------------------------------------------------------
+# --- the cost -----------------------------------------------------------------------------------------------------
 
-def test_cost_against_brute_force():
-    rng = np.random.default_rng(8)
-    view = island()
+def test_the_cost_against_brute_force():
+    rng, view = np.random.default_rng(8), island()
     clouds = view.cloud + rng.normal(0, 0.02, (3, 1, 3)).astype(np.float32)
     goal = Goal(project(np.array([[0.05, 0.02, 0.03]]), CAMERA), rng.uniform(0, 0.05, (15, 3)))
     away = np.linalg.norm(project(clouds[:, -1], CAMERA) - goal.pixels, axis=1)
@@ -258,106 +151,155 @@ def test_cost_against_brute_force():
     squared = np.sum((clouds[:, :, None] - goal.points) ** 2, axis=3)
     chamfer = squared.min(axis=2).mean(axis=1) + squared.min(axis=1).mean(axis=1)
     for pixel, shape in ((1.0, 0.0), (0.0, 1.0), (2.0, 3.0)):
-        found = planning.planning_cost(clouds, view, goal, CAMERA, Search(pixel_weight=pixel, chamfer_weight=shape))
-        expected = pixel * (away - planning.SLACK) + shape * 100 * np.sqrt(chamfer)
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
-    reached = Goal(project(view.cloud[-1:], CAMERA), view.cloud)
-    assert planning.planning_cost(view.cloud[None], view, reached, CAMERA, Search())[0] == 0
+        found = planning_cost(clouds, view, goal, CAMERA, Search(pixel_weight=pixel, chamfer_weight=shape))
+        np.testing.assert_allclose(found, pixel * (away - planning.SLACK) + shape * 100 * np.sqrt(chamfer), rtol=1e-5)
     with pytest.raises(ValueError, match="without a goal picture"):
-        planning.planning_cost(clouds, view, Goal(goal.pixels, None), CAMERA, Search())
+        planning_cost(clouds, view, Goal(goal.pixels, None), CAMERA, Search())
 
 
-def test_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects():
-    view = island()
-    table = np.float32([[0.2, 0.2, 0], [-0.2, 0.1, 0]])
-    two = View(np.vstack([table, view.cloud, [[0.01, 0, 0.03]]]).astype(np.float32), np.ones(24, bool),
-               np.r_[False, False, np.ones(22, bool)], np.full(24, 0.03), 2)
-    goal = Goal(project(two.cloud[-2:], CAMERA) + [[10, 0], [0, 4]], None)
-    found = planning.planning_cost(two.cloud[None], two, goal, CAMERA, Search(chamfer_weight=0.0))
+def test_the_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects():
+    view = island(marks=[[0, 0, 0.03], [0.01, 0, 0.03]], table=[[0.2, 0.2, 0], [-0.2, 0.1, 0]])
+    goal = Goal(project(view.cloud[-2:], CAMERA) + [[10, 0], [0, 4]], None)
+    found = planning_cost(view.cloud[None], view, goal, CAMERA, Search(chamfer_weight=0.0))
     assert found[0] == pytest.approx((10 + 4) / 2 - planning.SLACK, rel=1e-4)
-    there = Goal(project(two.cloud[-2:], CAMERA), two.cloud[2:])
-    assert planning.planning_cost(two.cloud[None], two, there, CAMERA, Search())[0] == 0
+    there = Goal(project(view.cloud[-2:], CAMERA), view.cloud[2:])
+    assert planning_cost(view.cloud[None], view, there, CAMERA, Search())[0] == 0
 
+
+# --- the cross entropy method ---------------------------------------------------------------------------------------
+
+def bowl(sequences):
+    """Lowest at (0.03, -0.05, pi): on the seam of the circle."""
+    x, y, angle = np.moveaxis(sequences[:, 0].astype(float), -1, 0)
+    return (x - 0.03) ** 2 + (y + 0.05) ** 2 + 0.01 * (1 + np.cos(angle))
+
+
+def first_population(seed, count=100):
+    return np.random.default_rng(seed).uniform([-0.2, -0.2, -np.pi], [0.2, 0.2, np.pi],
+                                               (count, 1, 3)).astype(np.float32)
+
+
+def test_refit_against_numpy_and_on_the_circle():
+    elites = np.random.default_rng(0).normal([0.1, -0.1, 0.5], [0.02, 0.03, 0.2], (50, 2, 3))
+    mean, deviation = planning.refit(elites)
+    np.testing.assert_allclose(mean[:, :2], elites[..., :2].mean(axis=0))
+    np.testing.assert_allclose(deviation[:, :2], elites[..., :2].std(axis=0))
+    np.testing.assert_allclose(mean[:, 2], elites[..., 2].mean(axis=0), atol=0.01)
+    elites[..., 2] = np.where(np.arange(50) % 2, np.pi - 0.1, -np.pi + 0.1)[:, None]  # both sides of the seam
+    mean, deviation = planning.refit(elites)
+    np.testing.assert_allclose(np.abs(mean[:, 2]), np.pi, atol=1e-9, err_msg="directions are not circular")
+    np.testing.assert_allclose(deviation[:, 2], 0.1)
+    assert (planning.refit(elites[:1])[1] >= [0.002, 0.002, 0.03]).all(), "the spread collapses"
+
+
+def test_cem_finds_the_minimum_of_a_bowl_where_a_part_is_forbidden():
+    seen = []
+
+    def cost(sequences):
+        return np.where(sequences[:, 0, 0] > 0.1, np.nan, bowl(sequences))
+    best, lowest = cem(cost, first_population(1), np.random.default_rng(1),
+                       Search(candidates=100, elites=10, iterations=12), lambda *state: seen.append(state))
+    np.testing.assert_allclose(best[0, :2], [0.03, -0.05], atol=0.006)
+    assert abs(abs(best[0, 2]) - np.pi) < 0.1 and lowest == bowl(best[None])[0]
+    assert [state[0] for state in seen] == list(range(12)) and np.isinf(seen[0][2]).any()
+    assert (np.diff([state[4][0, 0] for state in seen[:4]]) < 0).all()  # the Gaussian narrows
+    for _, population, costs, mean, deviation in seen:
+        assert np.abs(population[..., 2]).max() <= np.pi + 1e-6, "directions are not wrapped"
+        elites = population[np.argsort(costs, kind="stable")[:10]]
+        elites = elites[np.isfinite(np.sort(costs)[:10])]
+        for found, expected in zip((mean, deviation), planning.refit(elites)):
+            np.testing.assert_array_equal(found, expected)
+    assert all(len(np.unique(population[1:, 0, 0])) > 90 for _, population, *_ in seen), "the spread collapses"
+
+
+def test_elites_of_infinite_cost_are_left_out():
+    population, means = first_population(4), []
+
+    def cost(sequences):  # three candidates are possible, and they lie together
+        return np.where(np.arange(len(sequences)) < 3, 1.0 + np.arange(len(sequences)), np.inf)
+    population[:3] = np.float32([[[0.1, 0.1, 0.5]], [[0.11, 0.1, 0.5]], [[0.12, 0.1, 0.5]]])
+    cem(cost, population, np.random.default_rng(3), Search(iterations=1), lambda *state: means.append(state[3]))
+    np.testing.assert_allclose(means[0], [[0.11, 0.1, 0.5]], rtol=1e-5)
+
+
+def test_cem_keeps_the_best_ever_and_begins_every_round_with_it():
+    costs, rounds = [], []
+
+    def cost(sequences):  # from the second round on everything new is worse
+        rounds.append(sequences.copy())
+        costs.append(bowl(sequences) + (len(costs) > 0))
+        return costs[-1]
+    best, lowest = cem(cost, first_population(2), np.random.default_rng(2), Search(iterations=4))
+    assert lowest == costs[0].min()
+    for population in rounds[1:]:
+        np.testing.assert_array_equal(population[0], best)
+
+
+def test_nan_loses_and_where_nothing_is_possible_that_is_said():
+    population = first_population(4)
+    only = population[7].copy()
+
+    def cost(sequences):
+        return np.where((sequences == only).all(axis=(1, 2)), 1.0, np.nan)
+    best, lowest = cem(cost, population, np.random.default_rng(3), Search(iterations=3))
+    np.testing.assert_array_equal(best, only)
+    assert lowest == 1
+    with pytest.raises(planning.NoPoke, match="no candidate poke is possible"):
+        cem(lambda s: np.full(len(s), np.nan), population, np.random.default_rng(3), Search())
+
+
+@pytest.mark.parametrize("changes, named", [
+    (dict(candidates=0), "candidates"), (dict(elites=65), "elites"), (dict(iterations=0), "iterations"),
+    (dict(horizon=0), "horizon"), (dict(pixel_weight=-1.0), "pixel_weight"), (dict(chamfer_weight=np.nan), "chamfer"),
+    (dict(pixel_weight=0.0, chamfer_weight=0.0), "chamfer_weight")])
+def test_a_search_that_cannot_be(changes, named):
+    with pytest.raises(ValueError, match=named):
+        Search(**changes)
+
+
+# --- plans --------------------------------------------------------------------------------------------------------------
 
 def shift_along(view, length):
     """Rollouts of a model under which every poke shifts everything by `length` m along itself."""
     def step(clouds, pokes):
-        along = np.column_stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2]), 0 * pokes[:, 2]])
-        return clouds + length * along[:, None]
-    return lambda sequences: planning.roll(step, view, sequences, SETTINGS)
+        return clouds + length * np.column_stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2]), 0 * pokes[:, 2]])[:, None]
+    return lambda sequences: roll(step, view, sequences, SETTINGS)
 
 
-def test_a_plan_of_two_pokes_costs_the_mean_of_both():
-    view, there, search = island(), np.array([-0.06, 0, 0]), Search(horizon=2, candidates=128, iterations=3)
-    goal = Goal(project(view.cloud[-1:] + there, CAMERA), view.cloud + there)
-    found = planning.plan(shift_along(view, 0.02), view, goal, CAMERA, SETTINGS, search, np.random.default_rng(0))
-    clouds, starts = shift_along(view, 0.02)(found.pokes[None])
-    costs = [planning.planning_cost(clouds[:, h], view, goal, CAMERA, search)[0] for h in (0, 1)]
-    assert found.cost == pytest.approx(np.mean(costs)) and costs[1] < costs[0] and np.isfinite(starts).all()
-
-
-def test_arrows_begin_ten_centimetres_before_the_target():
-    starts, targets = planning.arrows_of(np.array([[0.05, 0.02, np.pi / 2]]), SETTINGS, CAMERA)
-    np.testing.assert_allclose(targets, project(np.array([[0.05, 0.02, 0]]), CAMERA))
-    np.testing.assert_allclose(starts, project(np.array([[0.05, -0.08, 0]]), CAMERA))
+def goal_at(view, there):
+    return Goal(project(view.cloud[-1:] + there, CAMERA), view.cloud + there)
 
 
 def test_plan_pushes_towards_the_goal_under_a_model_known_in_closed_form():
-    # Under this model every poke that starts 10 cm or more away shifts everything by 4 cm along itself.
-    view = island()
-    there = np.array([-0.04, 0.0, 0.0])
-    goal = Goal(project(view.cloud[-1:] + there, CAMERA), view.cloud + there)
-    rollout, rounds = shift_along(view, 0.04), []
-    found = planning.plan(rollout, view, goal, CAMERA, SETTINGS, Search(iterations=6), np.random.default_rng(9),
-                          lambda i, population, costs, mean, deviation: rounds.append(costs.min()))
+    view, rounds = island(), []
+    goal, rollout = goal_at(view, [-0.04, 0.0, 0.0]), shift_along(view, 0.04)
+    found = plan(rollout, view, goal, CAMERA, SETTINGS, Search(iterations=6), np.random.default_rng(9),
+                 lambda i, population, costs, mean, deviation: rounds.append(costs.min()))
     assert abs(abs(found.pokes[0, 2]) - np.pi) < 0.15
     assert found.cost < 0.1 * found.now and found.cost == min(rounds)
-    np.testing.assert_allclose(found.starts[0] + 0.1 * np.array([np.cos(found.pokes[0, 2]), np.sin(found.pokes[0, 2])]),
-                               found.pokes[0, :2], atol=1e-6)
-    again = planning.plan(rollout, view, goal, CAMERA, SETTINGS, Search(iterations=6), np.random.default_rng(9))
+    along = np.array([np.cos(found.pokes[0, 2]), np.sin(found.pokes[0, 2])])
+    np.testing.assert_allclose(found.starts[0] + 0.1 * along, found.pokes[0, :2], atol=1e-6)
+    again = plan(rollout, view, goal, CAMERA, SETTINGS, Search(iterations=6), np.random.default_rng(9))
     np.testing.assert_array_equal(again.pokes, found.pokes)
 
 
-# --- following marks ------------------------------------------------------------------------------------------
-
-def test_registration_against_a_known_motion():
-    from scipy.spatial import cKDTree
-    rng = np.random.default_rng(10)
-    points, colours = rng.uniform(-0.03, 0.03, (60, 3)), rng.uniform(0, 0.1, (60, 3))
-    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
-    after = np.column_stack([points[:, :2] @ turn.T + [0.02, -0.01], points[:, 2]])
-    tree = cKDTree(np.column_stack([after, colours]))
-    error, found, shift = planning._register(points, points, colours, tree)
-    np.testing.assert_allclose(found, turn, atol=1e-9)
-    np.testing.assert_allclose(shift, [0.02, -0.01], atol=1e-9)
-    assert error < 1e-15
+def test_a_plan_of_two_pokes_costs_the_mean_of_both():
+    view, search = island(), Search(horizon=2, candidates=128, iterations=3)
+    goal = goal_at(view, [-0.06, 0, 0])
+    found = plan(shift_along(view, 0.02), view, goal, CAMERA, SETTINGS, search, np.random.default_rng(0))
+    clouds, starts = shift_along(view, 0.02)(found.pokes[None])
+    costs = [planning_cost(clouds[:, h], view, goal, CAMERA, search)[0] for h in (0, 1)]
+    assert found.cost == pytest.approx(np.mean(costs)) and costs[1] < costs[0] and np.isfinite(starts).all()
 
 
-def test_marks_are_followed_over_real_pokes(pokes, run):
-    interactions, truth = pokes
-    errors, motions = [], []
-    for row in range(40):
-        labels, depth = truth.labels[row], interactions.depth_before[row]
-        marks, movers = [], []
-        for label in np.unique(labels[labels > 0]):
-            rows, columns = np.nonzero(labels == label)
-            if len(rows) >= 15:
-                marks.append((columns[len(rows) // 2], rows[len(rows) // 2]))
-                movers.append(label)
-        camera, empty = interactions.camera, interactions.empty_depth
-        try:
-            points = planning.points_at(marks, depth, empty, camera, SETTINGS)
-        except ValueError:  # an object so flat to the camera that this pixel of it counts as table
-            continue
-        true = points + true_scene_flow(points, np.array(movers), truth.poses_before[row], truth.poses_after[row])
-        view = planning.view_of(depth, empty, camera, SETTINGS, points)
-        after = planning.view_of(interactions.depth_after[row], empty, camera, SETTINGS, points)
-        moved, masks = planning.predict(run, camera, view, view.cloud[None], interactions.pokes[[row]])
-        found = planning.follow(view, interactions.rgb_before[row], interactions.pokes[row], moved[0], masks[0], after,
-                                interactions.rgb_after[row])
-        errors.extend(np.linalg.norm(found - true, axis=1))
-        motions.extend(np.linalg.norm(true - points, axis=1))
-    errors, motions = np.array(errors), np.array(motions)
-    assert len(errors) > 80 and (motions > 0.02).sum() > 15
-    assert np.median(errors[motions > 0.01]) < 0.005 < np.median(motions[motions > 0.01])
-    assert np.quantile(errors[motions < 0.001], 0.95) < 0.002
+def test_a_sequence_that_no_finger_can_start_is_ruled_out_however_cheap():
+    view = island()
+    goal = goal_at(view, [0, 0, 0])
+
+    def rollout(sequences):  # all is free of cost, but only pokes along +x have a start
+        clouds, starts = shift_along(view, 0.0)(sequences)
+        dear = np.cos(sequences[..., 2]) > 0
+        clouds = clouds + 0.05 * dear[..., None, None]
+        return clouds, np.where(dear[..., None], 0.0, np.nan)
+    found = plan(rollout, view, goal, CAMERA, SETTINGS, Search(), np.random.default_rng(0))
+    assert np.cos(found.pokes[0, 2]) > 0 and np.isfinite(found.starts).all()

@@ -4,8 +4,8 @@ Question: a depth camera says how far away each pixel is. Where in the room is t
 which pixel shows a given place?
 
 Equations:
-- Sec. III-A, the raw point cloud P_t = (X_t, Y_t, Z_t): `geometry.unproject`, `interactions.points_and_validity`; tests/test_geometry.py, tests/test_interactions.py
-- Sec. III-C, projection with known camera intrinsics: `geometry.project`, `geometry.Camera`, `geometry.look_at`; tests/test_geometry.py
+- Sec. III-A, the raw point cloud P_t = (X_t, Y_t, Z_t): `geometry.unproject`; tests/test_geometry.py
+- Sec. III-C, projection with known camera intrinsics: `geometry.project`, `geometry.Camera`; tests/test_geometry.py
 
 Time: 3 s. Pictures: 01_views.png, 01_other.png, 01_table.png, 01_missing.png.
 
@@ -16,6 +16,18 @@ Last lines to expect:
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `geometry.unproject` and `geometry.project` are the two
 # functions of this lesson; with your editor's "go to definition" each is one click away.
+#
+# Ten lessons take the model apart. They, the code and the paper call things by the same names:
+#
+#     P_t, P_{t+1}, P'_{t+1}     point clouds before and after a poke, and the predicted one [m]; lessons 01, 02
+#     m^k, R_k, T_k              K masks, and the rotation and translation of each; 02, 07
+#     D_{P'->P}, D_{P->P'}       distance maps between the predicted and the observed cloud [m^2]; 03
+#     U, V                       optical flow, to the right and down [px]; 04
+#     I_t, I_{t+1}, I'_t         pictures before and after, in [0, 1], and I_{t+1} warped back; 04
+#     L_CD, L_rec, L_fs, L_ds    the losses of Eq. (2) to (5); 03, 04, 05
+#     u_t = (a_x, a_y, a_theta)  a poke: its target on the table [m], its direction [rad]; 06
+#     s_t                        state embedding; 07
+#     B, H, W, N, K, J           pokes, rows and columns of a picture, points (H W), masks, candidate plans
 
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
@@ -25,8 +37,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from hind4sight_min import geometry, interactions, ops
-from hind4sight_min.figures import PALETTE
+from hind4sight_min import geometry
+from hind4sight_min.lab.figures import PALETTE
 
 options = lesson.begin("01_point_clouds")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -59,9 +71,9 @@ print("   unproject: ", corner)
 # %% [markdown]
 # ## A real depth picture
 #
-# Now a picture of the test set, 64 x 48 pixels. `points_and_validity` gives the points and, for each, whether its pixel
-# has a depth at all; more on that at the end. The cloud keeps the picture's layout: `points[v, u]` belongs to pixel
-# (u, v). Where the package wants a list of points it flattens the picture row by row.
+# Now a picture of the test set, 64 x 48 pixels. A pixel is *valid* if it has a depth at all; more on that at the end.
+# The cloud keeps the picture's layout: `points[v, u]` belongs to pixel (u, v). Where the package wants a list of points
+# it flattens the picture row by row; `scene.scene_of` prepares pictures that way.
 #
 # **Predict before you run:** the camera sits 62 cm above the table and 46 cm in front of its middle, looking down at
 # an angle. The table is flat. Along one *row* of the depth picture, does the depth of the table change? And along one
@@ -72,12 +84,12 @@ pokes, truth = lesson.pokes()
 ROW = 148
 camera, empty = pokes.camera, pokes.empty_depth
 image, depth = pokes.rgb_before[ROW] / 255, pokes.depth_before[ROW]
-points, valid = interactions.points_and_validity(depth, camera)  # (H, W, 3) m, (H, W) bool
+points, valid = geometry.unproject(depth, camera), depth > 0  # P_t (H, W, 3) m, (H, W) bool
 eye, forward = camera.arena_from_camera[:3, 3], camera.arena_from_camera[:3, 2]
 print(f"2. Poke {ROW}: the camera at {eye} m looks along {np.round(forward, 2)}")
 
-table, table_valid = interactions.points_and_validity(empty, camera)  # the empty arena
-inside = table_valid & (np.abs(table[..., :2]) < 0.22).all(axis=-1)  # away from the walls at 0.25 m
+table = geometry.unproject(empty, camera)  # the empty arena
+inside = (empty > 0) & (np.abs(table[..., :2]) < 0.22).all(axis=-1)  # away from the walls at 0.25 m
 v, u = 24, 32
 for name, line in ((f"row {v}", empty[v, inside[v]]), (f"column {u}", empty[inside[:, u], u])):
     print(f"   depth of the empty table along {name}: {line.min():.4f} to {line.max():.4f} m")
@@ -152,8 +164,10 @@ right = camera.arena_from_camera[:3, 0]
 behind = geometry.project(eye - 0.1 * forward + 0.02 * right, camera)  # 10 cm behind the camera, 2 cm to the right
 print(f"   a point 10 cm behind the camera lands at pixel {behind}")
 
+turn = np.eye(4)
+turn[:3, :3] = geometry.so3_exp(np.array([0, 0, 1.2]))  # about z, by 1.2 rad: the camera walks around to the right
 other = replace(camera, width=40, height=30, fx=camera.fx * 40 / 64, fy=camera.fy * 40 / 64, cx=19.5, cy=14.5,
-                arena_from_camera=geometry.look_at([0.55, -0.20, 0.65], [0, 0, 0]))  # a coarser one, to the right
+                arena_from_camera=turn @ camera.arena_from_camera)  # and has fewer pixels
 
 
 def splat(cloud, colours, seen_by):
@@ -187,20 +201,20 @@ lesson.keep(options, figure, "other")
 # Real depth cameras return 0 where they could not measure. Our simulated ones miss nothing, so we punch a hole: 15 of
 # the pixels of one object lose their depth. A depth of 0 becomes a point *at the camera*: finite numbers, far from
 # where they belong. Nothing fails; averages just go wrong. So the package carries the validity mask along with every
-# cloud, and counts a point only where the mask is true. Here the centre of one object, as the forward model takes it
-# (`ops.weighted_means`, a mean of points under a mask), with and without validity:
+# cloud, and counts a point only where the mask is true. Here the centre of one object, a mean of points under a mask,
+# as the forward model takes the centre of each of its masks, with and without validity:
 
 # %%
 label = np.argmax(np.bincount(truth.labels[ROW].ravel())[1:]) + 1  # the object that covers most pixels
 on_object = truth.labels[ROW] == label
 broken = depth.copy()
 broken.flat[np.flatnonzero(on_object)[:15]] = 0
-holed, holed_valid = interactions.points_and_validity(broken, camera)
+holed, holed_valid = geometry.unproject(broken, camera), broken > 0
 
 
 def centre_of(cloud, weights):
     """Mean of the points (H, W, 3) under the weights (H, W) -> (3,) m."""
-    return ops.weighted_means(cloud.reshape(1, -1, 3), weights.reshape(1, -1, 1).astype(np.float32))[0, 0]
+    return np.sum(cloud * weights[..., None], axis=(0, 1)) / weights.sum()
 
 
 true_centre = centre_of(points, on_object)
@@ -249,9 +263,9 @@ by_opencv, _ = cv2.projectPoints(flat.astype(float), cv2.Rodrigues(to_other[:3, 
                                  np.array([[other.fx, 0, other.cx], [0, other.fy, other.cy], [0, 0, 1]]), None)
 difference = np.abs(geometry.project(flat.astype(float), other) - by_opencv[:, 0]).max()
 lesson.check("largest difference to OpenCV's projection in the other camera [px]", float(difference), below=1e-6)
-middle = geometry.project(np.zeros(3), other) - (other.cx, other.cy)
-lesson.check("distance of the place it looks at from the middle of its picture [px]", float(np.linalg.norm(middle)),
-             0.0, within=1e-6)
+middle, its_middle = (geometry.project(np.zeros(3), each) - (each.cx, each.cy) for each in (camera, other))
+lesson.check("the origin does not turn: 40 / 64 as far above the middle as in the first picture [px]",
+             float(its_middle[1]), float(middle[1]) * 40 / 64, within=1e-6)
 lesson.check("column of the point behind the camera: fx * 0.02 / 0.05 + cx [px]", float(behind[0]),
              camera.fx * 0.4 + camera.cx, within=1e-6)
 lesson.check("pixels without depth after the hole", int(np.sum(~holed_valid)), 15, within=0)

@@ -4,9 +4,9 @@ Question: how can a network say "this object shifts and turns, that one stays" w
 can improve, starting from "nothing moves"?
 
 Equations:
-- Sec. III-A, a rigid motion [R, T] in SE(3): `geometry.so3_exp`; tests/test_geometry.py
-- Eq. (1), transform layer: `geometry.transform_layer`; tests/test_geometry.py
-- Sec. IV-C, true scene flow: `interactions.true_scene_flow`, `evaluation.true_motion`; tests/test_interactions.py
+- Sec. III-A, a rigid motion [R, T] in SE(3): `geometry.so3_exp`; tests/test_eq1_transform.py
+- Eq. (1), transform layer: `geometry.transform_layer`; tests/test_eq1_transform.py
+- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`, `lab.evaluation.true_motion`; tests/test_evaluation.py
 
 Time: 4 s. Pictures: 02_masks.png, 02_blend.png, 02_exp.png, 02_zero.png.
 
@@ -27,8 +27,11 @@ from autograd import grad
 from scipy.linalg import expm, expm_frechet
 from scipy.optimize import minimize
 
-from hind4sight_min import evaluation, geometry, interactions, losses
-from hind4sight_min.figures import PALETTE
+from hind4sight_min import geometry
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.se3nets import association_loss
+from hind4sight_min.sim.truth import rotation_from_quaternion
 
 options = lesson.begin("02_rigid_motion")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -89,9 +92,9 @@ lesson.keep(options, figure, "exp")
 #
 # ## Masks: who moves
 #
-# Eq. (1) moves every point by K rigid motions, weighted by its K *masks* m_k, which are between 0 and 1 and sum to 1:
+# Eq. (1) moves every point by K rigid motions, weighted by its K *masks* m^k, which are between 0 and 1 and sum to 1:
 #
-#     P' = sum_k m_k (R_k P + T_k)
+#     P'_{t+1} = sum_k m^k (R_k P_t + T_k)
 #
 # Mask 0 is the background, whose motion is the identity. First by hand, a point with a background mask of 0.25 and a
 # mask of 0.75 for a motion that turns by 90 degrees about z and shifts by 1 m along x:
@@ -115,15 +118,14 @@ print("   transform_layer:", np.round(moved, 6))
 pokes, truth = lesson.pokes()
 ROW = 92
 camera, image = pokes.camera, pokes.rgb_before[ROW] / 255
-points, _ = interactions.points_and_validity(pokes.depth_before[ROW], camera)
-cloud = points.reshape(1, -1, 3).astype(float)
-true_flow, _, moving = evaluation.true_motion(pokes, truth, ROW)  # (N, 3) m, and which points move
+cloud = geometry.unproject(pokes.depth_before[ROW], camera).reshape(1, -1, 3).astype(float)  # P_t
+true_flow, _, moving = true_motion(pokes, truth, ROW)  # (N, 3) m, and which points move
 labels = truth.labels[ROW].ravel()                                # (N,): 0 is the background, i + 1 is object i
 movers = np.unique(labels[moving])
 true_masks = (labels[:, None] == np.concatenate([[0], movers])).astype(float)[None]  # (1, N, K)
 true_masks[..., 0] = 1 - true_masks[..., 1:].sum(axis=-1)                            # what does not move is background
 before, after = (poses[ROW, movers - 1].astype(float) for poses in (truth.poses_before, truth.poses_after))
-turn_before, turn_after = (interactions.rotation_from_quaternion(poses[:, 3:]) for poses in (before, after))
+turn_before, turn_after = (rotation_from_quaternion(poses[:, 3:]) for poses in (before, after))
 turns = np.matmul(turn_after, np.swapaxes(turn_before, 1, 2))           # R = R_after R_before^T
 shifts = after[:, :3] - np.einsum("kij,kj->ki", turns, before[:, :3])  # T = c_after - R c_before
 true_rotations = np.concatenate([np.eye(3)[None], turns])[None]         # (1, K, 3, 3), the background's first
@@ -142,7 +144,7 @@ tinted = 0.4 + 0.6 * image.mean(axis=-1, keepdims=True).repeat(3, axis=-1)
 for k, colour in enumerate(colours, 1):
     tinted[labels.reshape(tinted.shape[:2]) == movers[k - 1]] = colour
 axes[1].imshow(tinted)
-axes[1].set_title("the masks: one colour each, grey is $m_0$", fontsize=11)
+axes[1].set_title("the masks: one colour each, grey is $m^0$", fontsize=11)
 for panel in axes[:2]:
     panel.set(xticks=[], yticks=[])
 axes[2].scatter(*cloud[0, :, :2].T, s=4, color="0.8", linewidths=0, antialiased=False)
@@ -203,7 +205,9 @@ print("4. Blended half and half with the identity, a turn by", *blend_angles, "d
 # Rodrigues' formula divides 0 by 0. Here is the formula as one would type it, and as one would then mend it, with a
 # `where` that replaces the quotients at zero. Both are differentiated by autograd and both return NaN: the derivative
 # of the *unused* branch of `where` is multiplied by 0, and 0 times NaN is NaN. After one step every parameter that this
-# gradient reaches is NaN. `so3_exp` uses a Taylor series for small angles and has its derivative written by hand.
+# gradient reaches is NaN. `so3_exp` has no quotient of its own: sin(t)/t is a *sinc*, which autograd knows how to
+# differentiate at zero, and (1 - cos t)/t^2 is half the square of another. Under the root of t = |w| stands a tiny
+# 1e-12, which keeps its derivative finite.
 
 # %%
 def typed_in(w, mend=False):
@@ -243,12 +247,12 @@ print(f"   away from zero, largest relative error: {worst['as typed in']:.0e} as
       "so3_exp")
 
 # %% [markdown]
-# Close to zero the typed-in formula returns numbers, but 1 - cos t subtracts two nearly equal ones and loses digits.
-# `so3_exp` writes it as 2 sin^2(t / 2), and takes the series below t = 0.01.
+# Close to zero the typed-in formula returns numbers, but 1 - cos t subtracts two nearly equal ones and loses digits; in
+# float32 nothing is left of it below t = 0.0002. `so3_exp` takes 2 sin^2(t / 2) for it, which subtracts nothing.
 #
 # Does it work? Let an optimiser find the motions of the two objects from where each of their points truly went, which
-# is what SE3-Nets are trained with (Sec. IV-D; `losses.association_loss`). The masks are given. It starts at a twist of
-# exactly zero, as the network does, and has nothing but the gradient through `so3_exp` and `transform_layer`.
+# is what SE3-Nets are trained with (Sec. IV-D; `lab.se3nets.association_loss`). The masks are given. It starts at a
+# twist of exactly zero, as the network does, and has nothing but the gradient through `so3_exp` and `transform_layer`.
 
 # %%
 targets = cloud + true_flow
@@ -268,7 +272,7 @@ def moved_by(twists):
 
 def squared_error(twists):
     """Mean over the points that move, in cm^2."""
-    return 1e4 * anp.sum(losses.association_loss(moved_by(twists), targets, everywhere)) / moving.sum()
+    return 1e4 * anp.sum(association_loss(moved_by(twists), targets, everywhere)) / moving.sum()
 
 
 path = [np.zeros(6 * len(movers))]

@@ -4,8 +4,10 @@ Question: two point clouds show the same scene before and after a poke, and nobo
 What number tells us how well a predicted motion explains the second cloud, and does its gradient lead there?
 
 Equations:
-- Eq. (2), distance transforms and Chamfer distance: `losses.distance_maps`, `losses.chamfer_loss`, `ops.nearest_squared_distances`; tests/test_losses.py, tests/test_ops.py
-- Sec. IV-B, depth noise: `interactions.add_depth_noise`; tests/test_interactions.py
+- Eq. (2), distance transforms and Chamfer distance: `losses.distance_maps`, `losses.chamfer_loss`,
+  `ops.nearest_squared_distances`; tests/test_eq2_chamfer.py, tests/test_ops.py
+- Not in the paper, which points count: `losses.seen_in_both`; tests/test_eq2_chamfer.py
+- Sec. IV-B, depth noise: `lab.noise.add_depth_noise`; tests/test_noise.py
 
 Time: 4 s. Pictures: 03_maps.png, 03_gradient.png, 03_basin.png.
 
@@ -20,13 +22,17 @@ Last lines to expect:
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
 
+from dataclasses import replace
+
 import autograd.numpy as anp
 import numpy as np
 from autograd import grad
 
-from hind4sight_min import evaluation, losses, ops
-from hind4sight_min.figures import PALETTE
-from hind4sight_min.interactions import add_depth_noise, occupied_pixels, points_and_validity
+from hind4sight_min import losses, ops
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.noise import add_depth_noise
+from hind4sight_min.training import scenes_of
 
 options = lesson.begin("03_chamfer")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -34,8 +40,9 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 # %% [markdown]
 # ## Nearest neighbours by hand
 #
-# Write P' for the *predicted* cloud (the points of the first picture, moved by the model) and P for the *observed* one
-# (the points of the second picture). For every point of P' we look up the nearest point of P, and the other way round:
+# Write P' for the *predicted* cloud P'_{t+1} (the points of the first picture, moved by the model) and P for the
+# *observed* one, P_{t+1} (the points of the second picture). For every point of P' we look up the nearest point of P,
+# and the other way round:
 #
 #     D_{P'->P}(i) = min_j |P'_i - P_j|^2        D_{P->P'}(j) = min_i |P'_i - P_j|^2
 #
@@ -65,20 +72,17 @@ print("   observed -> predicted:", to_predicted[0])  # 0.1^2, 0.2^2: nobody asks
 # %%
 interactions, truth = lesson.pokes()
 ROW = 1
-camera, shape = interactions.camera, interactions.depth_before.shape[1:]
+poke, shape = interactions[[ROW]], interactions.depth_before.shape[1:]
 
 
-def clouds(depth_before, depth_after):
-    """Two depth pictures (H, W) m -> two clouds (1, N, 3) m and which of their points have a counterpart (1, N)."""
-    depths = np.stack([depth_before, depth_after])
-    points, valid = points_and_validity(depths, camera)
-    occupied = occupied_pixels(depths, interactions.empty_depth)
-    before, after = points.reshape(2, 1, -1, 3)
-    return before, after, *losses.seen_in_both(*valid.reshape(2, 1, -1), *occupied.reshape(2, 1, -1))
+def clouds(poke):
+    """A record of one poke -> P_t and P_{t+1}, (1, N, 3) m, and which of their points have a counterpart, (1, N)."""
+    before, after = scenes_of(poke)
+    return before.points, after.points, *losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
 
 
-before, after, counted, next_counted = clouds(interactions.depth_before[ROW], interactions.depth_after[ROW])
-true_flow, _, moving = evaluation.true_motion(interactions, truth, ROW)  # (N, 3) m, and which points move
+before, after, counted, next_counted = clouds(poke)
+true_flow, _, moving = true_motion(interactions, truth, ROW)  # (N, 3) m, and which points move
 still_maps = losses.distance_maps(before, after, counted, next_counted)
 true_maps = losses.distance_maps(before + true_flow, after, counted, next_counted)
 still, best = (float(losses.chamfer_loss(*maps)[0]) for maps in (still_maps, true_maps))
@@ -101,7 +105,7 @@ lesson.keep(options, figure, "maps")
 # %% [markdown]
 # ## Where does the gradient point?
 #
-# **Predict before you run:** start from no motion, P' = the first cloud. Minus the gradient of the Chamfer distance,
+# **Predict before you run:** start from no motion, P'_{t+1} = P_t. Minus the gradient of the Chamfer distance,
 # taken at each predicted point, is the direction in which the loss wants that point to go. Which points get an arrow
 # at all? Do the arrows on the object all point along the true motion?
 
@@ -133,9 +137,9 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constraine
 x, y = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
 for panel, arrows, title, colour in ((left, pull / 4, "minus the gradient of Eq. (2), a quarter as long", PALETTE[5]),
                                      (right, true_flow, "the true scene flow", PALETTE[6])):
-    panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P'$", linewidths=0)
+    panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P_t$", linewidths=0)
     panel.scatter(*after[0, next_counted[0] & (after[0, :, 2] > 0.01), :2].T, s=16, marker="x", color=PALETTE[2],
-                  label="second cloud $P$, objects and walls only", linewidths=1)
+                  label="second cloud $P_{t+1}$, objects and walls only", linewidths=1)
     panel.quiver(*before[0, on_object, :2].T, *arrows[on_object, :2].T, color=colour, angles="xy", scale_units="xy",
                  scale=1, width=0.005)
     panel.set(aspect="equal", xlim=(x - 0.13, x + 0.13), ylim=(y - 0.10, y + 0.10), xlabel="x [m]", ylabel="y [m]")
@@ -167,16 +171,20 @@ rng = np.random.default_rng(0)
 scales = np.linspace(0, 2, 21)
 
 
-def curve(depth_before, depth_after):
+def curve(poke):
     """Chamfer distance in cm^2 with the object moved by every scale times its true motion."""
-    first, second, here, there = clouds(depth_before, depth_after)
+    first, second, here, there = clouds(poke)
     maps = [losses.distance_maps(first + np.float32(scale) * true_flow, second, here, there) for scale in scales]
     return np.array([1e4 * losses.chamfer_loss(*each)[0] for each in maps])
 
 
-depths = interactions.depth_before[ROW], interactions.depth_after[ROW]
-clean = curve(*depths)
-noisy = np.mean([curve(*(add_depth_noise(depth, rng, 0.01) for depth in depths)) for _ in range(5)], axis=0)
+def with_noise(poke):
+    return replace(poke, depth_before=add_depth_noise(poke.depth_before, rng, 0.01),
+                   depth_after=add_depth_noise(poke.depth_after, rng, 0.01))
+
+
+clean = curve(poke)
+noisy = np.mean([curve(with_noise(poke)) for _ in range(5)], axis=0)
 print(f"4. Lowest at {scales[clean.argmin()]:.1f} times the true motion without noise, at {scales[noisy.argmin()]:.1f} "
       f"with noise, which lifts the curve from {clean.min():.0f} to {noisy.min():.0f} cm^2")
 
@@ -193,9 +201,9 @@ figure.suptitle("One wide valley with its floor at the true motion; noise lifts 
 lesson.keep(options, figure, "basin")
 
 # %% [markdown]
-# **Now change this:** leave out `seen_in_both` (let `clouds` return `valid` twice instead). The table that the object
-# uncovers then counts too: where does the minimum of the curve go, and why would a network learn from that to drag the
-# table along? Then compare with docs/research-log.md, where the first checkpoint did just that.
+# **Now change this:** leave out `seen_in_both` (let `clouds` end with `before.valid, after.valid`). The table that the
+# object uncovers then counts too: where does the minimum of the curve go, and why would a network learn from that to
+# drag the table along? Then compare with docs/research-log.md, where the first checkpoint did just that.
 
 # %% Check
 print("5. Check")

@@ -5,8 +5,9 @@ the prediction is, and in which direction it should change?
 
 Equations:
 - Sec. III-C, projection layer, scene flow to optical flow: `geometry.optical_flow`; tests/test_geometry.py
-- Sec. III-C, backward warping: `losses.warp_backward`, `ops.bilinear_sample`; tests/test_losses.py, tests/test_ops.py
-- Eq. (3), photometric loss: `losses.photometric_loss`, `losses.seen_in_both`; tests/test_losses.py
+- Sec. III-C, backward warping: `losses.warp_backward`, `ops.bilinear_sample`; tests/test_eq3_photometric.py,
+  tests/test_ops.py
+- Eq. (3), photometric loss: `losses.photometric_loss`, `losses.seen_in_both`; tests/test_eq3_photometric.py
 
 Time: 6 s. Pictures: 04_warp.png, 04_basin.png, 04_stripes.png, 04_gradient.png.
 
@@ -24,11 +25,12 @@ import lesson  # first of all: it sets the number of BLAS threads
 import autograd.numpy as anp
 import numpy as np
 from autograd import grad
-from autograd.tracer import getval
 from scipy.ndimage import map_coordinates
 
-from hind4sight_min import evaluation, geometry, losses, training
-from hind4sight_min.figures import PALETTE, colour_wheel, flow_to_rgb
+from hind4sight_min import geometry, losses
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.lab.figures import PALETTE, colour_wheel, flow_to_rgb
+from hind4sight_min.training import scenes_of
 
 options = lesson.begin("04_warping")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -36,8 +38,8 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 # %% [markdown]
 # ## From scene flow to optical flow
 #
-# The *scene flow* of a point is its motion in space, P' - P, in metres. Its *optical flow* (U, V) is the motion of its
-# pixel, in pixels: U to the right, V down. The projection layer projects both ends and subtracts (Sec. III-C):
+# The *scene flow* of a point is its motion in space, P'_{t+1} - P_t, in metres. Its *optical flow* (U, V) is the motion
+# of its pixel, in pixels: U to the right, V down. The projection layer projects both ends and subtracts (Sec. III-C):
 #
 #     U = x' - x        V = y' - y        with x = fx X / Z + cx, y = fy Y / Z + cy  (lesson 01)
 #
@@ -61,14 +63,15 @@ print(f"   along the ray to the camera: {np.linalg.norm(along_ray):.3f}")
 # %% [markdown]
 # ## Backward warping by hand
 #
-# Write I for the picture before the poke and I+ for the one after. If the flow is right, the pixel (x, y) of I shows
-# the same bit of the world as the place (x + U, y + V) of I+. So we read I+ there, for every pixel of I: the result,
-# I', should look like I. It is called *backward* because the colours come back along the flow. Every pixel of I' gets
-# one colour; pushing the colours forward instead would leave holes and collisions. The place is usually between pixels;
-# then the colour is the mean of the four around it, the nearer the heavier (*bilinear*). A row of five grey values:
+# Write I_t for the picture before the poke and I_{t+1} for the one after. If the flow is right, the pixel (x, y) of I_t
+# shows the same bit of the world as the place (x + U, y + V) of I_{t+1}. So we read I_{t+1} there, for every pixel of
+# I_t: the result, I'_t, should look like I_t. It is called *backward* because the colours come back along the flow.
+# Every pixel of I'_t gets one colour; pushing the colours forward instead would leave holes and collisions. The place
+# is usually between pixels; then the colour is the mean of the four around it, the nearer the heavier (*bilinear*). A
+# row of five grey values:
 
 # %%
-row = np.array([0, 0.1, 0.4, 0.2, 0.3], np.float32).reshape(1, 1, 5, 1)  # I+: (B=1, H=1, W=5, C=1)
+row = np.array([0, 0.1, 0.4, 0.2, 0.3], np.float32).reshape(1, 1, 5, 1)  # I_{t+1}: (B=1, H=1, W=5, C=1)
 
 
 def flow_right(pixels, shape=(1, 1, 5)):
@@ -79,13 +82,13 @@ def flow_right(pixels, shape=(1, 1, 5)):
 print("2. The row", row.ravel(), "warped backward")
 for pixels in (1, 0.5, -2):
     warped, in_view = losses.warp_backward(row, flow_right(pixels))
-    print(f"   U = {pixels}: I' = {np.round(warped.ravel(), 3)}, in view: {in_view.ravel().astype(int)}")
+    print(f"   U = {pixels}: I'_t = {np.round(warped.ravel(), 3)}, in view: {in_view.ravel().astype(int)}")
 
 # %% [markdown]
 # Where the flow points out of the picture there is nothing to compare with, so `in_view` is false and the pixel costs
 # nothing. Eq. (3), the photometric loss, sums up what is left, over pixels and colours:
 #
-#     L_rec = sum_xy |I - I'|_1
+#     L_rec = sum_xy |I_t - I'_t|_1
 #
 # ## A real poke
 #
@@ -94,23 +97,24 @@ for pixels in (1, 0.5, -2):
 
 # %%
 ROW = 158
-batch = training.make_batch(interactions, np.array([ROW]), whole=True)  # clouds and pictures of one poke
-image, next_image = batch.images, batch.next_images                     # (1, H, W, 3) in [0, 1]
+before, after = scenes_of(interactions[[ROW]])
+image, next_image = before.images, after.images  # I_t, I_{t+1}: (1, H, W, 3) in [0, 1]
+shared, next_shared = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)  # (1, N) bool
 shape = image.shape[1:3]
-true_flow, true_pixels, moving = evaluation.true_motion(interactions, truth, ROW)  # (N, 3) m, (N, 2) px, (N,) bool
+true_flow, true_pixels, moving = true_motion(interactions, truth, ROW)  # (N, 3) m, (N, 2) px, (N,) bool
 labels = truth.labels[ROW].ravel()
 on_object = labels == np.bincount(labels[moving]).argmax()  # (N,): the pixels that show the object that moves most
 
 
 def pixels_of(scene_flow):
     """Scene flow (N, 3) m -> optical flow (1, H, W, 2) px."""
-    return anp.reshape(geometry.optical_flow(batch.points, batch.points + scene_flow[None], camera), (1, *shape, 2))
+    return anp.reshape(geometry.optical_flow(before.points, before.points + scene_flow[None], camera), (1, *shape, 2))
 
 
 none = np.zeros_like(true_flow)
 flows = {"no motion": pixels_of(none), "the true flow": pixels_of(true_flow)}
-costs = {name: float(losses.photometric_loss(image, next_image, flow, batch.shared)[0]) for name, flow in flows.items()}
-uncorrected = {name: float(losses.photometric_loss(image, next_image, flow, batch.valid)[0])
+costs = {name: float(losses.photometric_loss(image, next_image, flow, shared)[0]) for name, flow in flows.items()}
+uncorrected = {name: float(losses.photometric_loss(image, next_image, flow, before.valid)[0])
                for name, flow in flows.items()}
 length = np.linalg.norm(true_pixels[on_object], axis=1)
 print(f"3. Poke {ROW}: the object moves by {length.mean():.1f} pixels on average. Photometric loss")
@@ -118,17 +122,17 @@ for text, values in (("what both pictures show", costs), ("all pixels", uncorrec
     print(f"   {text}: " + ", ".join(f"{values[name]:.1f} for {name}" for name in flows))
 
 warped, in_view = losses.warp_backward(next_image, flows["the true flow"])
-counted = (batch.shared.reshape(1, *shape) & in_view)[0]
+counted = (shared.reshape(1, *shape) & in_view)[0]
 errors = [np.where(counted, np.abs(image - losses.warp_backward(next_image, flow)[0])[0].sum(axis=-1), np.nan)
           for flow in flows.values()]
 window = np.s_[14:48, 18:52]  # around the object
 grey = plt.get_cmap("magma").with_extremes(bad="0.6")
 figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
-panels = [("I, before", image[0]), ("I+, after", next_image[0]),
+panels = [("$I_t$, before", image[0]), ("$I_{t+1}$, after", next_image[0]),
           (f"true optical flow (wheel: {length.max():.0f} px)", flow_to_rgb(flows["the true flow"][0], length.max())),
-          ("I': I+ warped back along it", np.clip(warped[0], 0, 1)),
-          (f"|I - I+|, no motion: loss {costs['no motion']:.1f}", errors[0]),
-          (f"|I - I'|, true flow: loss {costs['the true flow']:.1f}", errors[1])]
+          ("$I'_t$: $I_{t+1}$ warped back along it", np.clip(warped[0], 0, 1)),
+          (f"$|I_t - I_{{t+1}}|$, no motion: loss {costs['no motion']:.1f}", errors[0]),
+          (f"$|I_t - I'_t|$, true flow: loss {costs['the true flow']:.1f}", errors[1])]
 for panel, (title, picture) in zip(axes.flat, panels):
     shown = panel.imshow(picture[window], cmap=grey, vmin=0, vmax=2)
     panel.set_title(title, fontsize=11)
@@ -142,10 +146,10 @@ figure.suptitle("Warped back along the true flow, the object lies where it was; 
 lesson.keep(options, figure, "warp")
 
 # %% [markdown]
-# Why is the object in I' twice? A table pixel that the object covers later does not move. It reads I+ at its own place
-# and finds the object there. That is no error of the flow, so it should not count: `losses.seen_in_both` (lesson 03)
-# leaves out the table that only one picture shows. If all pixels count, the covered table adds the same to both sums
-# above, and the only way to lower that part would be to move the table.
+# Why is the object in I'_t twice? A table pixel that the object covers later does not move. It reads I_{t+1} at its own
+# place and finds the object there. That is no error of the flow, so it should not count: `losses.seen_in_both` (lesson
+# 03) leaves out the table that only one picture shows. If all pixels count, the covered table adds the same to both
+# sums above, and the only way to lower that part would be to move the table.
 #
 # ## Why the basin is narrow
 #
@@ -161,15 +165,15 @@ tried = np.linspace(-4, 24, 225)  # multiples of 1/8 px
 profiles, lows = {}, {}
 figure, axes = plt.subplots(2, 2, figsize=(11, 4.6), layout="constrained", width_ratios=(1, 1.2), sharex="col")
 for (name, texture), (left, right), colour in zip(textures.items(), axes, (PALETTE[5], PALETTE[6])):
-    before = texture.astype(np.float32).reshape(1, 1, -1, 1)
-    after = np.roll(before, 10, axis=2)
+    bumps = texture.astype(np.float32).reshape(1, 1, -1, 1)
+    moved = np.roll(bumps, 10, axis=2)
     everywhere = np.ones((1, len(u)), bool)
-    values = profiles[name] = np.array([losses.photometric_loss(before, after, flow_right(pixels, (1, 1, len(u))),
+    values = profiles[name] = np.array([losses.photometric_loss(bumps, moved, flow_right(pixels, (1, 1, len(u))),
                                                                 everywhere)[0] for pixels in tried])
     inner = values[1:-1]
     lows[name] = tried[1:-1][(inner < values[:-2]) & (inner < values[2:]) & (inner < values.max() / 2)]
-    left.plot(u, before.ravel(), color="0.6", label="I")
-    left.plot(u, after.ravel(), color=colour, label="I+, moved by 10 px")
+    left.plot(u, bumps.ravel(), color="0.6", label="$I_t$")
+    left.plot(u, moved.ravel(), color=colour, label="$I_{t+1}$, moved by 10 px")
     left.set(ylabel="brightness", title=name)
     left.title.set_fontsize(11)
     left.legend(fontsize=9, loc="upper right")
@@ -196,16 +200,11 @@ lesson.keep(options, figure, "stripes")
 # the photometric loss? And from 5 cm away, does minus the gradient still point roughly towards the truth?
 
 # %%
-spacing, next_spacing = (geometry.ray_spacing(points, camera) for points in (batch.points, batch.next_points))
-
-
 def both_losses(offset):
     """Photometric loss and Chamfer distance in cm^2, the object moved by its true motion plus `offset` (3,) m."""
     scene_flow = true_flow + on_object[:, None] * offset
-    photometric = losses.photometric_loss(image, next_image, pixels_of(scene_flow), batch.shared)
-    predicted = batch.points + scene_flow[None]
-    free = geometry.free_radius(batch.points, getval(predicted), spacing)  # saves time, changes nothing
-    maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared, free, next_spacing)
+    photometric = losses.photometric_loss(image, next_image, pixels_of(scene_flow), shared)
+    maps = losses.distance_maps(before.points + scene_flow[None], after.points, shared, next_shared)
     return photometric[0], 1e4 * losses.chamfer_loss(*maps)[0]
 
 

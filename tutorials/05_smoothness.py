@@ -4,9 +4,11 @@ Question: many predictions explain two pictures almost equally well. Which of th
 a preference for smooth fields do to the rims of objects?
 
 Equations:
-- Eq. (4), smoothness of the flow: `losses.flow_smoothness_loss`, `losses.edge_weights`, `ops.total_variation`; tests/test_losses.py, tests/test_ops.py
-- Eq. (5), smoothness of the distance maps: `losses.distance_smoothness_loss`; tests/test_losses.py
-- Eq. (2) and (3) for comparison: `losses.chamfer_loss`, `losses.photometric_loss`; tests/test_losses.py
+- Eq. (4), smoothness of the flow: `losses.flow_smoothness_loss`, `losses.edge_weights`,
+  `losses.edge_aware_smoothness`; tests/test_eq4_flow_smoothness.py
+- Eq. (5), smoothness of the distance maps: `losses.distance_smoothness_loss`; tests/test_eq5_distance_smoothness.py
+- Eq. (2) and (3) for comparison: `losses.chamfer_loss`, `losses.photometric_loss`; tests/test_eq2_chamfer.py,
+  tests/test_eq3_photometric.py
 
 Time: 7 s. Pictures: 05_flows.png, 05_follow.png, 05_edges.png, 05_maps.png, 05_holes.png.
 
@@ -26,8 +28,9 @@ import numpy as np
 from autograd import grad
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from hind4sight_min import evaluation, geometry, losses, training
-from hind4sight_min.figures import PALETTE, flow_to_rgb
+from hind4sight_min import geometry, losses, training
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.lab.figures import PALETTE, flow_to_rgb
 
 options = lesson.begin("05_smoothness")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -35,16 +38,16 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 # %% [markdown]
 # ## A step by hand
 #
-# Write U and V for the optical flow in pixels (lesson 04) and I for the picture before the poke. Eq. (4) adds up the
+# Write U and V for the optical flow in pixels (lesson 04) and I_t for the picture before the poke. Eq. (4) adds up the
 # steps of the flow between neighbouring pixels, across and down, each with a weight that is small where the picture has
 # an edge:
 #
-#     L_fs = sum_xy |grad U| e^(-|grad I|) + |grad V| e^(-|grad I|)
+#     L_fs = sum_xy |grad U| e^(-|grad I_t|) + |grad V| e^(-|grad I_t|)
 #
 # `grad` is the difference between neighbours. Rigid objects move as a whole, so inside of them the flow changes slowly
 # or not at all; at their rims it jumps, and there the picture usually has an edge. How fast the weight falls depends on
-# the numbers in I. Ours are between 0 and 1, and the package takes exp(-40 |grad I|), with |grad I| the mean over the
-# three colours (`EDGE_SHARPNESS`; more on it below). A row of four pixels whose flow jumps by 2 pixels in the middle:
+# the numbers in I_t. Ours are between 0 and 1, and the package takes exp(-40 |grad I_t|), with |grad I_t| the mean over
+# the three colours (`EDGE_SHARPNESS`; more on it below). A row of four pixels whose flow jumps by 2 pixels:
 
 # %%
 flow_row = np.array([[0.0, 0], [0, 0], [2, 0], [2, 0]]).reshape(1, 1, 4, 2)  # (B=1, H=1, W=4, (U, V))
@@ -76,11 +79,12 @@ rng = np.random.default_rng(0)
 
 
 class Poke:
-    """One poke whose truth we look at: its batch, its true flow, and the object that moved, or None if not just one."""
+    """One poke whose truth we look at: its scenes, its true flow, and the object that moved, if it was just one."""
 
     def __init__(self, row):
-        self.batch = training.make_batch(interactions, np.array([row]), whole=True)
-        self.scene_flow, pixels, moving = evaluation.true_motion(interactions, truth, row)  # (N, 3) m, (N, 2) px, (N,)
+        self.before, self.after = before, after = training.scenes_of(interactions[[row]])
+        self.shared = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+        self.scene_flow, pixels, moving = true_motion(interactions, truth, row)  # (N, 3) m, (N, 2) px, (N,)
         self.flow = pixels.reshape(1, *shape, 2)
         labels = truth.labels[row].ravel()
         movers = np.unique(labels[moving])
@@ -103,18 +107,20 @@ class Poke:
 
     def terms(self, scene_flow):
         """For a scene flow (N, 3) m: L_CD, L_ds, L_rec and L_fs, and the two distance maps."""
-        batch = self.batch
-        predicted = batch.points + scene_flow[None]
-        flow = geometry.optical_flow(batch.points, predicted, camera).reshape(self.flow.shape)
-        maps = losses.distance_maps(predicted, batch.next_points, batch.shared, batch.next_shared)
+        before, after, flow = self.before, self.after, self.pixels_of(scene_flow)
+        maps = losses.distance_maps(before.points + scene_flow[None], after.points, *self.shared)
         return np.array([losses.chamfer_loss(*maps)[0],
-                         losses.distance_smoothness_loss(*maps, batch.images, batch.next_images, batch.shared,
-                                                         batch.next_shared)[0],
-                         losses.photometric_loss(batch.images, batch.next_images, flow, batch.shared)[0],
+                         losses.distance_smoothness_loss(*maps, before.images, after.images, *self.shared)[0],
+                         losses.photometric_loss(before.images, after.images, flow, self.shared[0])[0],
                          self.flow_smoothness(flow)]), maps
 
+    def pixels_of(self, scene_flow):
+        """Scene flow (N, 3) m -> optical flow (1, H, W, 2) px."""
+        points = self.before.points
+        return geometry.optical_flow(points, points + scene_flow[None], camera).reshape(self.flow.shape)
+
     def flow_smoothness(self, flow):
-        return losses.flow_smoothness_loss(flow, self.batch.images, self.batch.valid)[0]
+        return losses.flow_smoothness_loss(flow, self.before.images, self.before.valid)[0]
 
 
 ROW = 146
@@ -127,14 +133,14 @@ print(f"2. Poke {ROW}: L_fs of " + ", ".join(f"{name} {cost:.1f} px" for name, c
 
 window = np.s_[24:48, 34:62]  # around the object
 longest = float(np.linalg.norm(poke.flow, axis=-1).max())
-across, down = losses.edge_weights(poke.batch.images)
+across, down = losses.edge_weights(poke.before.images)
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.9), layout="constrained")
-axes[0, 0].imshow(poke.batch.images[0][window])
-axes[0, 0].set_title("the picture I", fontsize=11)
+axes[0, 0].imshow(poke.before.images[0][window])
+axes[0, 0].set_title("the picture $I_t$", fontsize=11)
 for panel, weights, name in ((axes[0, 1], across, "to the right"), (axes[0, 2], down, "down")):
     shown = panel.imshow(weights[0][window], cmap="cividis", vmin=0, vmax=1)
     panel.set_title(f"weight of a step {name}", fontsize=11)
-figure.colorbar(shown, ax=axes, label="$e^{-40 |\\nabla I|}$", shrink=0.48, anchor=(0, 1))
+figure.colorbar(shown, ax=axes, label="$e^{-40 |\\nabla I_t|}$", shrink=0.48, anchor=(0, 1))
 for panel, name in zip(axes[1], list(flows)[1:]):
     panel.imshow(flow_to_rgb(flows[name][0], longest)[window])
     panel.set_title(f"{name}: $L_{{fs}}$ = {costs[name]:.0f} px", fontsize=11)
@@ -151,9 +157,9 @@ lesson.keep(options, figure, "flows")
 #
 # ## How sharp should the weight be?
 #
-# The paper prints exp(-|grad I|). For I between 0 and 1 that is never below e^-1: no edge would make a step cheap. Try
-# other sharpnesses on pokes that pushed one object by 1 to 3 cm, and price three flows: the true one, the spilled one,
-# and one with a *hole*, in which the object's core stays behind and only its outer two pixels move.
+# The paper prints exp(-|grad I|). For a picture between 0 and 1 that is never below e^-1: no edge would make a step
+# cheap. Try other sharpnesses on pokes that pushed one object by 1 to 3 cm, and price three flows: the true one, the
+# spilled one, and one with a *hole*, in which the object's core stays behind and only its outer two pixels move.
 
 # %%
 group = []
@@ -174,8 +180,7 @@ def sharpened(sharpness, function):
         losses.EDGE_SHARPNESS = usual
 
 
-three = [(p.flow, p.spilled(), geometry.optical_flow(p.batch.points, p.batch.points + p.holed()[None],
-                                                     camera).reshape(p.flow.shape)) for p in group]
+three = [(p.flow, p.spilled(), p.pixels_of(p.holed())) for p in group]
 sharpnesses = np.array([1, 2.5, 5, 10, 20, 40, 80, 160])
 prices = np.array([sharpened(s, lambda: [[p.flow_smoothness(flow) for flow in each] for p, each in zip(group, three)])
                    for s in sharpnesses]).mean(axis=1)  # (sharpnesses, flows) px, the mean over the pokes
@@ -194,7 +199,7 @@ axes[1].semilogx(sharpnesses, spill_ratio, "s-", color=PALETTE[6], label="spille
 axes[1].semilogx(sharpnesses, hole_ratio, "^-", color=PALETTE[5], label="with a hole / true")
 for panel in axes:
     panel.axvline(losses.EDGE_SHARPNESS, color="0.5", linestyle=":", label="the package's 40")
-    panel.set(xlabel="sharpness s in $e^{-s |\\nabla I|}$")
+    panel.set(xlabel="sharpness s in $e^{-s |\\nabla I_t|}$")
     panel.legend(fontsize=9)
 axes[0].set(ylabel="mean $L_{fs}$ [px]")
 axes[1].set(ylabel="times the true flow's price", ylim=(0, None))
@@ -214,7 +219,7 @@ lesson.keep(options, figure, "edges")
 # %%
 def follow(flow, sharpness, steps=400, rate=0.02):
     """Gradient descent on L_fs -> the flows after every step, (steps + 1, 1, H, W, 2) px."""
-    slope = grad(lambda f: anp.sum(losses.flow_smoothness_loss(f, poke.batch.images, poke.batch.valid)))
+    slope = grad(lambda f: anp.sum(losses.flow_smoothness_loss(f, poke.before.images, poke.before.valid)))
 
     def descend():
         path = [flow]
@@ -254,12 +259,13 @@ lesson.keep(options, figure, "follow")
 # An object that moves by less than its own size overlaps with where it was. In the overlap, points of the first cloud
 # find close neighbours in the second, though these are other bits of the object. The Chamfer distance, Eq. (2), takes
 # that for "did not move". So a mask with a hole, whose core stays behind, costs it little. Eq. (5) treats the two
-# distance maps of lesson 03 as Eq. (4) treats the flow. Write I+ for the picture after the poke:
+# distance maps of lesson 03 as Eq. (4) treats the flow:
 #
-#     L_ds = sum_xy |grad D_{P->P'}| e^(-|grad I+|) + |grad D_{P'->P}| e^(-|grad I|)
+#     L_ds = sum_xy |grad D_{P->P'}| e^(-|grad I_{t+1}|) + |grad D_{P'->P}| e^(-|grad I_t|)
 #
-# The paper prints I+ in both terms; D_{P'->P} lies on the grid of the first picture, so the package takes I there. A
-# hole makes the maps uneven inside the object: D is large where the moved points left a gap, and zero beside it.
+# The paper prints I_{t+1} in both terms; D_{P'->P} lies on the grid of the first picture, so the package takes I_t
+# there. A hole makes the maps uneven inside the object: D is large where the moved points left a gap, and zero beside
+# it.
 
 # %%
 none = np.zeros_like(poke.scene_flow)
@@ -340,7 +346,7 @@ slope = grad(lambda flow: anp.sum(losses.flow_smoothness_loss(flow, edge, all_se
 for column, wanted in ((1, -np.exp(-2)), (2, np.exp(-2))):
     lesson.check(f"gradient to U at column {column} of the jump", float(slope[column]), wanted, within=1e-4)
 step_up, high = np.array([[0, 0, 1, 1.0]]), np.array([[0, 3, 3, 3.0]])  # D_{P'->P} and D_{P->P'}
-lesson.check("Eq. (5) by hand: D_{P'->P} jumps by 1 at the edge in I, D_{P->P'} by 3 in a flat I+",
+lesson.check("Eq. (5) by hand: D_{P'->P} jumps by 1 at the edge in I_t, D_{P->P'} by 3 in a flat I_{t+1}",
              float(losses.distance_smoothness_loss(step_up, high, edge, 0 * edge, all_seen, all_seen)[0]),
              3 + np.exp(-2), within=1e-4)
 slopes = grad(lambda maps: anp.sum(losses.distance_smoothness_loss(maps[0], maps[1], edge, 0 * edge, all_seen,

@@ -4,10 +4,12 @@ Question: a robot stands before a table with unknown objects. How does it find s
 write down of a poke, and why is that enough to learn from?
 
 Equations:
-- Sec. IV-A, background subtraction and the grid: `interactions.occupied_pixels`, `simulator.occupied_cells`, `interactions.cells_of`; tests/test_interactions.py, tests/test_simulator.py
-- Sec. III-A and IV-A, a poke: `simulator.Arena.sample_poke`, `simulator.Arena.poke`, `networks.poke_frame`; tests/test_simulator.py, tests/test_networks.py
-- Sec. IV-B, the data set: `simulator.collect_shard`; tests/test_simulator.py
-- Sec. IV-C, true scene flow: `interactions.true_scene_flow`; tests/test_interactions.py
+- Sec. IV-A, background subtraction and the grid: `scene.scene_of`, `interactions.occupied_grid`,
+  `interactions.cells_of`; tests/test_scene.py, tests/test_interactions.py
+- Sec. III-A and IV-A, a poke: `sim.arena.Arena.sample_poke`, `sim.arena.Arena.poke`, `geometry.poke_frame`;
+  tests/test_simulator.py, tests/test_geometry.py
+- Sec. IV-B, the data set: `sim.collection.collect_shard`; tests/test_simulator.py
+- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`; tests/test_evaluation.py
 
 Time: 6 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
 
@@ -21,15 +23,22 @@ Last lines to expect:
 # so.
 
 # %%
-from dataclasses import asdict
+import lesson  # first of all: it sets the number of BLAS threads
 
-import lesson
+from dataclasses import asdict, replace
+
 import numpy as np
 from matplotlib.patches import Circle, FancyArrowPatch
 
-from hind4sight_min import evaluation, interactions, networks, simulator
-from hind4sight_min.figures import OUTLINE, PALETTE
-from hind4sight_min.geometry import project, unproject
+from hind4sight_min import interactions, scene
+from hind4sight_min.geometry import poke_frame, project, unproject
+from hind4sight_min.lab.evaluation import MOVING
+from hind4sight_min.lab.figures import OUTLINE, PALETTE
+from hind4sight_min.lab.noise import add_depth_noise
+from hind4sight_min.sim.arena import Arena, Settings
+from hind4sight_min.sim.collection import collect_shard
+from hind4sight_min.sim.truth import true_scene_flow
+from hind4sight_min.training import scenes_of
 
 options = lesson.begin("06_poke_simulator")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -41,15 +50,15 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 # pictures of colour and of depth. The robot has one finger: a vertical cylinder that comes down at a *start*, moves
 # in a straight line to a *target* and is lifted again. Sec. III-A writes a poke as three numbers,
 #
-#     u = (a_x, a_y, a_theta)
+#     u_t = (a_x, a_y, a_theta)
 #
 # the target on the table in metres, and the direction in radians from which the finger gets there.
 #
-# `simulator.Arena` is that arena. Here it also takes a picture every few steps of Bullet, to have a film to look
+# `sim.arena.Arena` is that arena. Here it also takes a picture every few steps of Bullet, to have a film to look
 # at. The robot has no film: it takes one picture before the poke and one after.
 
 # %%
-class FilmedArena(simulator.Arena):
+class FilmedArena(Arena):
     """An arena that also keeps pictures of what happens during a poke."""
     film, steps = (), 0
 
@@ -62,10 +71,10 @@ class FilmedArena(simulator.Arena):
 
 
 try:
-    with FilmedArena(simulator.Settings(width=192, height=144), np.random.default_rng(23)) as arena:
+    with FilmedArena(Settings(width=192, height=144), np.random.default_rng(23)) as arena:
         arena.new_scene()
         (rgb, depth, labels), empty_depth = arena.observe(), arena.empty_depth
-        poke, start = arena.sample_poke(depth)
+        poke, start = arena.sample_poke(rgb, depth)
         arena.film, arena.steps = [rgb], 0
         at_rest = arena.poke(poke, start)
         film = [*arena.film, arena.observe()[0]]
@@ -75,7 +84,7 @@ except RuntimeError as error:
     recorded, truth = lesson.pokes()
     rgb, depth, labels = recorded.rgb_before[1], recorded.depth_before[1], truth.labels[1]
     poke, start, film, at_rest = recorded.pokes[1], recorded.starts[1], [rgb, recorded.rgb_after[1]], True
-    camera, settings, empty_depth, bullet = recorded.camera, recorded.meta["settings"], recorded.empty_depth, False
+    camera, settings, empty_depth, bullet = recorded.camera, recorded.settings, recorded.empty_depth, False
 print(f"1. A poke from ({start[0]:.2f}, {start[1]:.2f}) m to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction "
       f"{np.degrees(poke[2]):.0f} degrees; then everything {'came to rest' if at_rest else 'kept moving'}.")
 
@@ -89,11 +98,20 @@ print(f"1. A poke from ({start[0]:.2f}, {start[1]:.2f}) m to ({poke[0]:.2f}, {po
 # down as the start.
 
 # %%
-THRESHOLD = interactions.OCCUPIED  # m
-NOISE = 0.0                        # m, standard deviation of the depth noise of Sec. IV-B; see the experiment below
-seen = interactions.add_depth_noise(depth, np.random.default_rng(0), NOISE)
-occupied = interactions.occupied_pixels(seen, empty_depth, THRESHOLD)
-cells = simulator.occupied_cells(seen, empty_depth, camera, settings, THRESHOLD)
+THRESHOLD = scene.OCCUPIED  # m
+NOISE = 0.0                 # m, standard deviation of the depth noise of Sec. IV-B; see the experiment below
+scene.OCCUPIED = THRESHOLD
+seen = add_depth_noise(depth, np.random.default_rng(0), NOISE)
+
+
+def occupied_cells(pictures):
+    """A Scene of B pictures -> the cells that something stands in, (B, rows, columns) bool."""
+    return np.concatenate([interactions.occupied_grid(points[None], occupied, settings)
+                           for points, occupied in zip(pictures.points, pictures.occupied)])
+
+
+now = scene.scene_of(seen[None], rgb[None], empty_depth, camera, settings["arena"])
+occupied, cells = now.occupied.reshape(depth.shape), occupied_cells(now)[0]
 side, half = settings["cell"], settings["arena"] / 2
 print(f"2. Nearer than the empty arena by more than {1000 * THRESHOLD:.0f} mm: {occupied.sum()} of {occupied.size} "
       f"pixels, {cells.sum()} of {cells.size} cells")
@@ -128,7 +146,9 @@ figure.suptitle("One picture of the empty arena is enough to find targets; a sta
                 fontsize=11)
 lesson.keep(options, figure, "grid")
 
-part = networks.windows(poke[None], camera)[0]  # half the picture, around the target
+middle, size = project(np.array([*poke[:2], 0.02]), camera), np.array([camera.width, camera.height]) // 2
+left, top = np.clip(middle - size / 2, 0, size).astype(int)
+part = np.s_[top:top + size[1], left:left + size[0]]  # half the picture, around the target
 figure, axes = plt.subplots(1, len(film), figsize=(11, 9.6 / len(film) + 0.6), layout="constrained")
 for number, (panel, frame) in enumerate(zip(axes, film)):
     ends = number in (0, len(film) - 1)
@@ -145,14 +165,14 @@ lesson.keep(options, figure, "film")
 # The robot wanted nothing in particular, so no poke can fail. What it keeps of each is
 #
 # - the colour and depth pictures before and after,
-# - the poke u, and the cells of its start and its target.
+# - the poke u_t, and the cells of its start and its target.
 #
-# In hindsight this is a solved exercise, twice. For the *forward model*: given the first picture and u, what is the
+# In hindsight this is a solved exercise, twice. For the *forward model*: given the first picture and u_t, what is the
 # second picture? For the *inverse model*: given both pictures, which were the two cells? Neither answer needs a
 # person. What nobody writes down is which pixel is which object and where each point went: the masks and motions
 # must be found without that.
 #
-# `simulator.collect_shard` repeats this: look, draw a poke, poke, look again. After six pokes it sets up a new
+# `sim.collection.collect_shard` repeats this: look, draw a poke, poke, look again. After six pokes it sets up a new
 # scene. Pokes after which something left the arena or the picture, or did not come to rest, are dropped and
 # counted.
 #
@@ -162,15 +182,14 @@ lesson.keep(options, figure, "film")
 # %%
 POKES = 40 if options.quick else 120
 if bullet:
-    recorded, truth, _ = simulator.collect_shard(simulator.Settings(), 1, 0, POKES)
+    recorded, truth, _ = collect_shard(Settings(), 1, 0, POKES)
 else:
     recorded, truth = recorded[:POKES], truth[slice(POKES)]
 exists = np.abs(truth.poses_before).sum(axis=2) > 0                                # (M, 7): which rows hold an object
 shift = truth.poses_after[..., :3] - truth.poses_before[..., :3]                   # (M, 7, 3) m
-moved = exists & (np.linalg.norm(shift, axis=2) > evaluation.MOVING)               # (M, 7)
+moved = exists & (np.linalg.norm(shift, axis=2) > MOVING)                          # (M, 7)
 counts = moved.sum(axis=1)
-grids = np.stack([simulator.occupied_cells(seen, recorded.empty_depth, recorded.camera, recorded.meta["settings"])
-                  for seen in recorded.depth_before])                              # (M, rows, columns)
+grids = occupied_cells(scenes_of(recorded)[0])                                     # (M, rows, columns)
 print(f"3. {len(recorded)} pokes: something moves in {np.mean(counts > 0):.0%}, two objects or more in "
       f"{np.mean(counts > 1):.0%}. Only {grids.mean():.0%} of the cells are occupied.")
 
@@ -181,7 +200,7 @@ print(f"3. {len(recorded)} pokes: something moves in {np.mean(counts > 0):.0%}, 
 #
 # Draw the motion of every object that moved as an arrow. In the arena's frame, left, there is no pattern: objects
 # lie anywhere and are pushed anywhere. Now turn and shift each poke so that its target is the origin and its
-# direction is the x axis, right: `networks.poke_frame`. The pattern is plain, and it is the *same* for every poke.
+# direction is the x axis, right: `geometry.poke_frame`. The pattern is plain, and it is the *same* for every poke.
 # The network reads the points in this frame (tutorial 07), so it need not learn each corner of the arena on its
 # own.
 
@@ -189,7 +208,7 @@ print(f"3. {len(recorded)} pokes: something moves in {np.mean(counts > 0):.0%}, 
 rows, objects = np.nonzero(moved)
 where = truth.poses_before[rows, objects][:, None, :3].astype(np.float32)          # (n, 1, 3) m, centres before
 there = where + shift[rows, objects][:, None]
-here_local, there_local = (networks.poke_frame(points, recorded.pokes[rows])[:, 0] for points in (where, there))
+here_local, there_local = (poke_frame(points, recorded.pokes[rows])[:, 0] for points in (where, there))
 local_shift = there_local - here_local
 lengths = np.linalg.norm(local_shift[:, :2], axis=1)
 first = counts[rows] == 1                                                          # pokes that moved one object only
@@ -223,12 +242,12 @@ lesson.keep(options, figure, "hindsight")
 # **Now change this:** set `NOISE = 0.01`, the depth noise of Sec. IV-B. How many of the 400 cells are occupied now,
 # and what would the robot poke at? Then raise `THRESHOLD` until the bare table is quiet again. What has become of
 # the objects by then? (The Check cell will object to all of this.) The shipped pokes were collected without noise;
-# noise is added when a model is trained or evaluated, and `interactions.smooth_depth` then takes a part of it out
-# again.
+# noise is added when a model is trained or evaluated, and `lab.noise.smooth_depth` then takes a part of it out again.
 
 # %% Check
 print("5. Check")
-four = interactions.occupied_pixels(np.array([[1.0, 0.995, 0.9, 0.0]]), np.ones((1, 4)), 0.008)
+row_of_four, from_afar = np.array([[[1.0, 0.995, 0.9, 0.0]]]), replace(camera, width=4, height=1)
+four = scene.scene_of(row_of_four, np.zeros((1, 1, 4, 3)), np.ones((1, 4)), from_afar, 100.0).occupied
 lesson.check("four pixels: 0, 5 mm and 10 cm nearer, missing; only the third is occupied (a digit each)",
              int(four[0] @ [1000, 100, 10, 1]), 10, within=0)
 inside = np.abs(unproject(depth, camera)[..., :2]).max(axis=2) < half
@@ -244,7 +263,7 @@ travel = recorded.pokes[:, :2] - recorded.starts
 turn = recorded.pokes[:, 2] - np.arctan2(travel[:, 1], travel[:, 0])
 lesson.check("largest angle between a_theta and start-to-target [degrees]",
              float(np.degrees(np.abs((turn + np.pi) % (2 * np.pi) - np.pi)).max()), 0, within=0.1)
-least, most = recorded.meta["settings"]["poke_length"]
+least, most = recorded.settings["poke_length"]
 length = np.linalg.norm(travel, axis=1)
 lesson.check("shortest path of a finger [m]", float(length.min()), above=least - 1e-4)
 lesson.check("longest path of a finger [m]", float(length.max()), below=most + 1e-4)
@@ -253,10 +272,9 @@ lesson.check("share of targets on an occupied cell", float(hit.mean()), 1, withi
 x, y, angle = recorded.pokes[0]
 beside = np.float32([[[x - 0.05 * np.sin(angle), y + 0.05 * np.cos(angle), 0]]])
 lesson.check("5 cm to the left of the target, in the poke's frame: distance to (0, 0.05, 0) [m]",
-             float(np.linalg.norm(networks.poke_frame(beside, recorded.pokes[:1]) - [0, 0.05, 0])), 0, within=1e-5)
+             float(np.linalg.norm(poke_frame(beside, recorded.pokes[:1]) - [0, 0.05, 0])), 0, within=1e-5)
 turned = np.array([[0.1, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]])  # moved by 10 cm, turned by 90 degrees
-flow = interactions.true_scene_flow(np.array([[[0.02, 0, 0.01]]]), np.array([[1]]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]),
-                                    turned)
+flow = true_scene_flow(np.array([[[0.02, 0, 0.01]]]), np.array([[1]]), np.array([[0, 0, 0, 0, 0, 0, 1.0]]), turned)
 lesson.check("true flow of a point at (2, 0, 1) cm, distance to (8, 2, 0) cm [m]",
              float(np.linalg.norm(flow[0, 0] - [0.08, 0.02, 0])), 0, within=1e-6)
 lesson.check("share of pokes that move something", float(np.mean(counts > 0)), above=0.8)

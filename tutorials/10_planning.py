@@ -5,9 +5,10 @@ and what is left of the plan once it meets the world?
 
 Equations:
 - Sec. III-H, cross entropy method: `planning.cem`, `planning.refit`, `planning.plan`; tests/test_planning.py
-- Sec. III-H, actions inside the training distribution: `planning.draw_pokes`, `planning.possible_starts`; tests/test_planning.py
+- Sec. III-H, actions inside the training distribution: `planning.draw_pokes`, `planning.possible_starts`;
+  tests/test_planning.py
 - Sec. IV-G, cost in 2D and 3D: `planning.planning_cost`; tests/test_planning.py
-- Sec. IV-G, closed loop: `control.closed_loop`, `planning.follow`; tests/test_control.py, tests/test_planning.py
+- Sec. IV-G, closed loop: `lab.control.closed_loop`, `lab.marks.follow`; tests/test_control.py, tests/test_marks.py
 
 Time: 5 s. Pictures: 10_population.png, 10_loop.png, 10_cost.png, 10_sequence.gif.
 
@@ -22,18 +23,20 @@ Last lines to expect:
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
 
-from dataclasses import asdict
-
 import numpy as np
 
-from hind4sight_min import control, evaluation, figures, planning, training
-from hind4sight_min.figures import PALETTE
+from hind4sight_min import planning, training
 from hind4sight_min.geometry import project
+from hind4sight_min.lab import control, figures
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.marks import points_at
 
 options = lesson.begin("10_planning")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 SEARCH = planning.Search(iterations=3) if options.quick else planning.Search()
+MOVERS = 1  # objects to move, 1 to 3
 run = training.load_run(lesson.data_small() / "checkpoint.npz")
 
 # %% [markdown]
@@ -41,31 +44,27 @@ run = training.load_run(lesson.data_small() / "checkpoint.npz")
 #
 # The user marks one point per object that shall move, and the pixel where that point shall go. The robot also has a
 # picture of the goal. Everything it knows of the scene is a *cloud*: the points of its depth picture and, behind
-# them, the marked ones.
+# them, the marked ones. `planning.View` holds it.
 
 # %%
 try:
-    with control.random_task(0, 1) as task:
-        (rgb, depth, _), goal_picture, empty = task.arena.observe(), task.goal, task.arena.empty_depth
-        camera, settings = task.arena.camera, asdict(task.arena.settings)
-        marks, goal_marks = task.marks, task.goal_marks
+    with control.random_task(0, MOVERS) as task:
+        (rgb, *_), view, goal = control.first_look(task)
+        camera, settings, goal_rgb = task.arena.camera, task.settings, task.goal[0]
     simulator = True
 except RuntimeError as error:
     print(f"Note: {error}. A shipped poke takes the place of the scene; the closed loop is left out.")
     interactions, truth = lesson.pokes()
-    row, camera, settings, simulator = 46, interactions.camera, interactions.meta["settings"], False
-    rgb, depth, empty = interactions.rgb_before[row], interactions.depth_before[row], interactions.empty_depth
-    goal_picture = interactions.rgb_after[row], interactions.depth_after[row]
-    flow, _, moving = evaluation.true_motion(interactions, truth, row)
+    row, camera, settings, simulator = 46, interactions.camera, interactions.settings, False
+    before, after = training.scenes_of(interactions[[row]])
+    rgb, (flow, _, moving) = interactions.rgb_before[row], true_motion(interactions, truth, row)
     index = np.flatnonzero(moving)[moving.sum() // 2]
-    marks = np.array([[index % camera.width, index // camera.width]])
-    point = planning.points_at(marks, depth, empty, camera, settings)
-    goal_marks = project(point + flow[[index]], camera)
+    view = planning.view_of(before, points_at([(index % camera.width, index // camera.width)], before, camera))
+    goal = planning.goal_of(project(view.marks + flow[[index]], camera), after)
 
-view = planning.view_of(depth, empty, camera, settings, planning.points_at(marks, depth, empty, camera, settings))
-goal = planning.goal_of(goal_marks, camera, settings, goal_picture[1], empty)
-print(f"1. A cloud of {len(view.cloud)} points, {view.occupied.sum()} of them on objects; the mark is "
-      f"{np.linalg.norm(marks - goal_marks):.1f} px from its goal")
+marks = project(view.marks, camera)
+print(f"1. A cloud of {len(view.cloud)} points, {view.occupied.sum()} of them on objects; marks are "
+      f"{np.linalg.norm(marks - goal.pixels, axis=1).mean():.1f} px from their goals")
 
 # %% [markdown]
 # ## What a poke would cost
@@ -80,9 +79,9 @@ print(f"1. A cloud of {len(view.cloud)} points, {view.occupied.sum()} of them on
 
 # %%
 angles = np.linspace(-np.pi, np.pi, 25 if options.quick else 73)
-target = view.cloud[-1, :2]
+target = view.marks[0, :2]
 pokes = np.float32([[[*target, angle]] for angle in angles])  # (J, H=1, 3)
-step = planning.learned_step(run, camera, view)
+step = planning.learned_step(run, view)
 
 
 def rollout(sequences):
@@ -111,7 +110,7 @@ lesson.keep(options, figure, "cost")
 # %% [markdown]
 # ## The cross entropy method
 #
-# A poke has three numbers, u = (a_x, a_y, a_theta). The cross entropy method (CEM) keeps a Gaussian over them:
+# A poke has three numbers, u_t = (a_x, a_y, a_theta). The cross entropy method (CEM) keeps a Gaussian over them:
 #
 # 1. draw J candidates, the first time as the training pokes were drawn: on what stands in the arena, from anywhere;
 # 2. roll all of them out with the model, in one call, and compute their costs; what cannot be costs infinity;
@@ -127,28 +126,29 @@ rounds = []
 
 
 def remember(iteration, population, costs, mean, deviation):
-    rounds.append((*planning.arrows_of(population[:, 0], settings, camera), costs))
+    rounds.append((*figures.arrows_of(population[:, 0], settings, camera), costs))
 
 
 found = planning.plan(rollout, view, goal, camera, settings, SEARCH, np.random.default_rng(0), remember)
 print(f"3. Cost {found.now:.1f} as it is; lowest per round: " + ", ".join(f"{costs.min():.2f}" for *_, costs in rounds))
-figure = figures.population_figure(rgb / 255, rounds, project(view.cloud[-1:], camera), goal.pixels)
+figure = figures.population_figure(rgb / 255, rounds, marks, goal.pixels)
 lesson.keep(options, figure, "population")
 
 # %% [markdown]
 # ## The closed loop
 #
 # The world does not do quite what the model says. So only the first poke is carried out; then the robot looks again
-# and plans anew, until the goal is reached, no poke is predicted to help, or six pokes are spent. Between two
-# pictures it must find the marked point again: `planning.follow` starts from the motion that the model predicts for
-# the mark's mask and corrects it by registering the two pictures.
+# and plans anew, until the goal is reached, no poke is predicted to help, or the pokes are spent. Between two pictures
+# it must find the marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's
+# mask and corrects it by registering the two pictures.
 
 # %%
 if simulator:
-    with control.random_task(0, 1) as task:
-        record = control.closed_loop(task, run, "learned", SEARCH, budget=6, seed=0)
-    with control.random_task(0, 1) as task:  # the same scene again
-        random = control.closed_loop(task, run, "random", SEARCH, budget=6, seed=0)
+    BUDGET = 2 + 4 * MOVERS
+    with control.random_task(0, MOVERS) as task:
+        record = control.closed_loop(task, run, "learned", SEARCH, BUDGET, seed=0)
+    with control.random_task(0, MOVERS) as task:  # the same scene again
+        random = control.closed_loop(task, run, "random", SEARCH, BUDGET, seed=0)
     left, lost = (each["distance"].mean(axis=1) for each in (record, random))
     print(f"4. {len(record['pokes'])} planned pokes: " + " -> ".join(f"{100 * d:.1f}" for d in left)
           + " cm from the goal")
@@ -166,16 +166,15 @@ if simulator:
     second.legend(fontsize=9)
     figure.suptitle("The closed loop closes in on the goal; random pokes do not", fontsize=11)
     lesson.keep(options, figure, "loop")
-    ends = [planning.places_on_table(each, camera) for each in (record["starts"], record["pokes"][:, :2])]
-    figures.save_sequence(options.out / "10_sequence.gif", record["rgb"] / 255, goal_picture[0] / 255,
+    ends = [figures.on_table(each, camera) for each in (record["starts"], record["pokes"][:, :2])]
+    figures.save_sequence(options.out / "10_sequence.gif", record["rgb"] / 255, goal_rgb / 255,
                           np.stack(ends, axis=1), project(record["marks"], camera), record["goal_marks"], left)
     print("   picture: 10_sequence.gif")
 
 # %% [markdown]
 # **Now change this:** give the search one of its terms alone, `planning.Search(chamfer_weight=0.0)` or
 # `planning.Search(pixel_weight=0.0)`, and look at what is left after the loop, and at how the object is turned. Then
-# try three objects: `control.random_task(0, 3)` in both calls of the closed loop. docs/results/planning.json has both
-# for sixty scenes.
+# try `MOVERS = 3`. docs/results/planning.json has both for sixty scenes.
 
 # %% Check
 print("5. Check")
@@ -185,12 +184,13 @@ squared = np.sum((clouds[0, 0][view.occupied][:, None] - goal.points) ** 2, axis
 by_hand = 100 * np.sqrt(squared.min(axis=1).mean() + squared.min(axis=0).mean())
 lesson.check("Chamfer term against brute force [cm]", float(terms["root of the Chamfer distance, cm"][0]),
              float(by_hand), within=1e-3)
-pixel = float(np.linalg.norm(project(clouds[0, 0, -1:], camera) - goal.pixels)) - planning.SLACK
-lesson.check("pixel term against the projection by hand [px]", float(terms["pixel distance, px"][0]), max(pixel, 0.0),
+away = np.linalg.norm(project(clouds[0, 0, -view.marked:], camera) - goal.pixels, axis=1)
+pixel = float(np.maximum(away - planning.SLACK, 0).mean())
+lesson.check("pixel term against the projection by hand [px]", float(terms["pixel distance, px"][0]), pixel,
              within=1e-3)
 whole = float(planning.planning_cost(clouds[:1, 0], view, goal, camera, planning.Search())[0])
-lesson.check("both terms together", whole, max(pixel, 0.0) + by_hand, within=1e-3)
-lesson.check("cost of the plan / of leaving all as it is", found.cost / found.now, below=0.7)
+lesson.check("both terms together", whole, pixel + by_hand, within=1e-3)
+lesson.check("cost of the plan / of leaving all as it is", found.cost / found.now, below=1 - 0.3 / MOVERS)  # one poke moves one object
 lesson.check("cost of the plan / lowest of the first round", found.cost / rounds[0][2].min(), below=1.0001)
 if simulator:
     lesson.check("distance left after the loop / at the start", float(left[-1] / left[0]), below=0.35)

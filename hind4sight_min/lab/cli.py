@@ -1,0 +1,408 @@
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce; `hind4sight COMMAND --help`."""
+import argparse
+import json
+import os
+import sys
+import sysconfig
+import time
+from dataclasses import asdict
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from .. import check_whole, planning, training
+from ..files import write_json
+from ..geometry import project
+from ..interactions import load_interactions
+from ..networks import Sizes
+from ..sim.arena import Settings
+from ..sim.collection import collect
+from ..sim.objects import KINDS, TEXTURES
+from ..sim.truth import load_truth
+from . import control, evaluation, tables
+from .noise import under_noise
+from .processes import pool_map
+from .runs import train_saving
+
+# `figures` is imported where a picture is made: Matplotlib takes a third of a second, in every worker process too.
+
+
+def data_small():
+    """The folder of the shipped data: beside the package in a clone, under share/ after a plain install."""
+    clone = Path(__file__).resolve().parents[2] / "data_small"
+    return clone if clone.is_dir() else Path(sysconfig.get_path("data")) / "share" / "hind4sight_min" / "data_small"
+
+
+# --- what is printed -------------------------------------------------------------------------------------
+
+def progress_line(label):
+    """A callable (done, total) that keeps one line with the time left up to date; None away from a terminal."""
+    if not sys.stderr.isatty():
+        return None
+    start = time.perf_counter()
+
+    def show(done, total):
+        left = (time.perf_counter() - start) / max(done, 1) * (total - done)
+        end = "\n" if done >= total else ""
+        print(f"\r{label}: {done} of {total}, {left:.0f} s left \033[K", end=end, file=sys.stderr, flush=True)
+    return show
+
+
+REPORT = (  # metric, unit, what it is, its baseline
+    ("flow_epe_cm", "cm", "scene flow: error of moving points", "no_motion_epe_cm"),
+    ("flow_rmse_cm", "cm", "scene flow: root mean square", "no_motion_rmse_cm"),
+    ("still_epe_cm", "cm", "scene flow: drift of still points", None),
+    ("all_epe_cm", "cm", "scene flow: error of all points", None),
+    ("mask_iou", "", "masks: IoU of the moved objects", None),
+    ("optical_epe_px", "px", "optical flow: error of moving pixels", "no_motion_optical_epe_px"),
+    ("optical_epe_all_px", "px", "optical flow: error of all pixels", "no_motion_optical_epe_all_px"),
+    ("inverse_target_cm", "cm", "inverse model: median target error", "inverse_target_chance_cm"),
+    ("inverse_direction_deg", "deg", "inverse model: median direction error", "inverse_direction_chance_deg"),
+)
+GROUPS = (("", "all of them"), ("single_", "pokes that move one object"), ("multi_", "pokes that move two or more"),
+          ("wall_", "pokes that end at a wall"), ("trimmed_", "without the worst 1 %"))
+
+
+def print_metrics(metrics):
+    print(f"{metrics['pokes']:.0f} pokes, {metrics['pokes_moved']:.0f} of them moved something; squared error of scene "
+          "flow / no motion:")
+    for group, meaning in GROUPS:
+        count = metrics[f"{group}pokes" if group else "pokes_moved"]
+        if count:
+            ratio, error = metrics[f"{group}flow_mse_ratio"], metrics[f"{group}flow_mse_ratio_se"]
+            print(f"  {meaning:<40}{ratio:8.3f} \u00b1 {error:.3f}   {count:.0f} pokes")
+    for name, unit, meaning, baseline in REPORT:
+        beside = "   chance" if baseline and "chance" in baseline else "   no motion"
+        beside = f"{beside} {metrics[baseline]:.3g}" if baseline else ""
+        print(f"  {meaning:<40}{metrics[name]:8.3f} {unit:<4}{beside}".rstrip())
+
+
+# --- commands ----------------------------------------------------------------------------------------------
+
+def simulate(folder, pokes, seed, jobs, settings=Settings()):
+    """`collect` over so many processes, with a line that says what came of it -> its counts and times."""
+    check_whole("jobs", jobs, 1)
+    with pool_map(jobs) as map:
+        result = collect(folder, pokes, seed, settings, map, progress_line("collect"))
+    counts, share = result["counts"], result["share_in_bullet"]
+    dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
+    spent = "all there already" if share is None else f"{share:.0%} of the time in Bullet's stepping and rendering"
+    print(f"{folder}: {counts['kept']} pokes in {result['seconds']:.1f} s; dropped: {dropped}; {spent}")
+    return result
+
+
+def run_collect(args):
+    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
+                        textures=tuple(args.textures), width=args.size[0], height=args.size[1])
+    result = simulate(args.out, args.pokes, args.seed, args.jobs, settings)
+    write_json(args.json, {"collect_seconds": result["seconds"], "collect_share_in_bullet": result["share_in_bullet"],
+                           **{f"pokes_{name}": count for name, count in result["counts"].items()}})
+
+
+def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, **given):
+    """A fresh Run as the options of `train` say."""
+    recipe = training.Recipe(**given, sizes=Sizes(masks=masks, width=width),
+                             weights={**training.WEIGHTS, **dict(weight)})
+    run = training.start_run(recipe, interactions)
+    run.meta["depth_noise"] = depth_noise
+    return run
+
+
+def run_train(args):
+    from . import figures
+    out = Path(args.out)
+    if out.suffix != ".npz":  # a folder of pokes without a checkpoint after it, or a name its log would take
+        raise ValueError(f"out: expected a name ending in .npz for the checkpoint, got {args.out!r}")
+    interactions = load_interactions(args.data)
+    given = {name: value for name, value in vars(args).items() if value is not None and name not in (
+        "command", "function", "data", "out", "jobs", "json", "resume")}
+    if args.resume and given:
+        raise ValueError(f"--resume: goes on with the recipe of {out}, which --{min(given).replace('_', '-')} cannot "
+                         "change")
+    if out.exists() and not args.resume:
+        raise ValueError(f"{out}: exists already; --resume goes on with it")
+    run, show = training.load_run(out) if args.resume else new_run(interactions, **given), progress_line("train")
+
+    def on_step(run, terms):
+        if show:
+            show(run.step, run.recipe.steps)
+
+    def on_epoch(entry):
+        terms = ", ".join(f"{name} {entry[name]:.4g}" for name in training.WEIGHTS if name in entry)
+        print(f"epoch {entry['epoch']}, step {entry['step']}: {terms}", flush=True)
+
+    noise = run.meta.get("depth_noise")
+    objective = partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
+    log = train_saving(interactions, run, out, objective, args.jobs, on_step, on_epoch)
+    figures.save_figure(figures.training_figure(log), out.with_suffix(".png"))
+    print(f"{out}: {run.step} steps, {run.meta['seconds']:.0f} s in all")
+    write_json(args.json, {"train_seconds": run.meta["seconds"], **{f"loss_{k}": v for k, v in log[-1].items()}})
+
+
+def run_evaluate(args):
+    run, interactions = training.load_run(args.checkpoint), load_interactions(args.data)
+    training.check_camera(run, interactions.camera)
+    metrics = evaluation.evaluate(run, interactions, load_truth(args.data), progress_line("evaluate"))
+    print_metrics(metrics)
+    write_json(args.json, metrics)
+
+
+def run_show(args):
+    from . import figures
+    run, interactions, truth = training.load_run(args.checkpoint), load_interactions(args.data), load_truth(args.data)
+    training.check_camera(run, interactions.camera)
+    row = args.row
+    if row is None:  # a poke that moved something well, not the best one
+        motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
+        row = int(np.argsort(motion)[int(0.7 * len(motion))])
+    if not 0 <= row < len(interactions):
+        raise ValueError(f"row: expected 0 to {len(interactions) - 1}, got {row}")
+    answer = evaluation.ask(run, interactions, row)
+    figures.save_figure(figures.interaction_figure(interactions, row, answer, truth), args.out)
+    print(f"{args.out}: interaction {row}")
+
+
+def run_reproduce(args):
+    if args.table == "planning":
+        return run_reproduce_planning(args)
+    scale = tables.QUICK if args.quick else tables.FULL
+    names = list(tables.TABLES) if args.table == "all" else [args.table]
+    out = Path(args.out or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
+    found = tables.reproduce(names, out, scale, args.jobs, progress=progress_line("collect"))
+    print(tables.tables_text(names, found))
+    write_json(args.json or out / f"{args.table}.json", found)
+
+
+def run_reproduce_planning(args):
+    from . import figures
+    out = Path(args.out or "runs/planning")
+    found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
+    print(tables.planning_table(found))
+    print(f"Obstacles avoided: planned {found['learned_obstacle_avoided']:.0%}, straight at the goal "
+          f"{found['greedy_obstacle_avoided']:.0%}")
+    figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
+    write_json(args.json or out / "figures.json", found)
+
+
+SEARCH_OPTIONS = "candidates", "iterations", "horizon", "pixel_weight", "chamfer_weight"
+
+
+def run_plan(args):
+    run, options = training.load_run(args.checkpoint), {name: getattr(args, name) for name in SEARCH_OPTIONS}
+    if (args.mark is None) != (args.goal is None):
+        raise ValueError("--mark, --goal: expected both or neither; --goal says where a marked point shall go")
+    own = args.click or args.mark is not None
+    if own:
+        options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
+    search = planning.Search(**options)
+    with control.random_task(args.seed, args.objects, args.obstacle) as task:
+        training.check_camera(run, task.arena.camera)
+        if own:
+            marks, goals = click(task.arena.observe()[0]) if args.click else (args.mark, args.goal)
+            task = control.marked_task(task, marks, goals)
+        meta = {"seed": args.seed, "movers": args.objects, "obstacle": args.obstacle, "policy": args.policy,
+                "search": asdict(search)}
+        distance = plan_and_show(run, task, search, args.budget, Path(args.out), meta)
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0])})
+
+
+def plan_and_show(run, task, search, budget, out, meta):
+    """The closed loop on a task: a line per poke, and into the folder `out` a record, the first plan's population and
+    an animation -> mean distance to the goals at first and after every poke, m.
+    """
+    from . import figures
+    camera, rounds, image = task.arena.camera, [], task.arena.observe()[0] / 255
+
+    def on_iteration(iteration, population, costs, mean, deviation):
+        if len(rounds) == iteration:  # of the first plan
+            rounds.append((*figures.arrows_of(population[:, 0], task.settings, camera), costs))
+
+    record = control.closed_loop(task, run, meta["policy"], search, budget, meta["seed"], on_iteration)
+    distance, pokes, starts = record["distance"].mean(axis=1), record["pokes"], record["starts"]
+    for t, poke in enumerate(pokes):
+        done = "" if np.isfinite(starts[t]).all() else "  (no room for the finger: not carried out)"
+        print(f"  poke {t + 1} to ({poke[0]:6.3f}, {poke[1]:6.3f}) m, direction {np.degrees(poke[2]):4.0f} deg: "
+              f"{100 * distance[t]:5.1f} -> {100 * distance[t + 1]:5.1f} cm from the goals{done}")
+    control.save_record(out / "plan.npz", record, meta)
+    marks, goals = project(record["marks"], camera), record["goal_marks"]
+    figures.save_sequence(out / "plan.gif", record["rgb"] / 255, record["goal_rgb"] / 255 if task.goal else None,
+                          figures.on_table(np.stack([starts, pokes[:, :2]], axis=1), camera), marks, goals, distance)
+    if rounds:
+        figures.save_figure(figures.population_figure(image, rounds, marks[0], goals), out / "cem.png")
+    print(f"{out}/plan.gif: {len(pokes)} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
+    return distance
+
+
+def click(image):
+    """Let the user click in a window: a point on an object, then where it shall go, and so on; Enter ends.
+
+    -> marks, goals (M, 2) px. Raises ValueError for an odd number of clicks or none, RuntimeError without a display.
+    """
+    import matplotlib.pyplot as plt
+    if plt.get_backend().lower() == "agg":
+        raise RuntimeError("--click: there is no display to open a window on; give --mark and --goal in pixels instead")
+    plt.imshow(image)
+    plt.title("click a point on an object, then its goal; and so on; Enter ends")
+    points = np.array(plt.ginput(n=-1, timeout=0))
+    plt.close()
+    if len(points) == 0 or len(points) % 2:
+        raise ValueError(f"--click: expected pairs of clicks, a mark and its goal, got {len(points)}")
+    return points[::2], points[1::2]
+
+
+# --- the demo ----------------------------------------------------------------------------------------------
+
+DEMO_POKES, DEMO_TEST_POKES, DEMO_STEPS = 2000, 200, 1000
+NO_BULLET = ("Without pybullet nothing can be simulated or planned, so this demo takes the shipped pokes; to get it, pip "
+             "install pybullet (ready-made for Python 3.11 and older; later versions compile it)")
+
+
+def run_demo(args):
+    """The whole paper on pokes just simulated; without pybullet, all but planning on the shipped ones."""
+    began, out, simulating = time.perf_counter(), Path(args.out), find_spec("pybullet") is not None
+    train, test = (out / "train", out / "test") if simulating else (data_small() / "train", data_small() / "test")
+    model, found = out / "checkpoint.npz", out / "metrics.json"
+
+    def run(text, *arguments):
+        arguments = [str(each) for each in arguments]
+        print(f"\n{text}\n$ hind4sight {' '.join(arguments)}", flush=True)
+        parsed = build_parser().parse_args(arguments)
+        parsed.function(parsed)
+
+    jobs = "--jobs", args.jobs
+    if simulating:
+        run("Simulate pokes: before, after, and the poke alone.",
+            "collect", train, "--pokes", DEMO_POKES, "--seed", args.seed, *jobs)
+        run("Some more, to test with.", "collect", test, "--pokes", DEMO_TEST_POKES, "--seed", args.seed + 1, *jobs)
+    else:
+        print(NO_BULLET)
+    model.unlink(missing_ok=True)
+    run("Train on them without labels: Chamfer, photometric, smoothness and inverse losses (Eq. 6).",
+        "train", train, model, "--steps", DEMO_STEPS, "--learning-rate", 0.002, "--seed", args.seed, *jobs)
+    run("Evaluate on pokes that were never trained on.", "evaluate", model, test, "--json", found)
+    metrics = json.loads(found.read_text())
+    run("Look at one of them.", "show", model, test, "--out", out / "interaction.png")
+    if simulating:
+        run("Plan pokes to a goal with the model (CEM), carry them out, look again; in a scene of neither pokes.",
+            "plan", model, "--seed", args.seed + 2, "--budget", 6, "--out", out, "--json", found)
+        metrics.update(json.loads(found.read_text()))
+    metrics["seconds"] = time.perf_counter() - began
+    print(f"The whole demo took {metrics['seconds']:.0f} s.")
+    write_json(args.json or found, {f"demo_{name}": value for name, value in metrics.items()})
+
+
+# --- the command line -----------------------------------------------------------------------------------------
+
+def term_weight(text):
+    """'photometric=0.5' -> ('photometric', 0.5)."""
+    name, _, value = text.partition("=")
+    try:
+        if name in training.WEIGHTS:
+            return name, float(value)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"expected TERM=VALUE, a number for one of {', '.join(training.WEIGHTS)}, got "
+                                     f"{text!r}")
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """argparse without the usage text before an error."""
+
+    def error(self, message):
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def build_parser():
+    """The parser of all commands; each sets `function`, which `main` calls with the arguments."""
+    parser = OneLineParser(prog="hind4sight", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    settings, recipe = Settings(), training.Recipe()
+    shared = {"checkpoint": {"nargs": "?", "default": data_small() / "checkpoint.npz"},
+              "data": {"nargs": "?", "default": data_small() / "test"}, "--seed": {"type": int, "default": 0},
+              "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"},
+              "--json": {"metavar": "FILE", "help": "write the figures here too"}}
+
+    def command(name, function, text, *options):
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(function=function)
+        for option in options:
+            sub.add_argument(option, **shared[option])
+        return sub.add_argument
+
+    def add_fields(add, record, *names, **how):
+        for name in names:
+            value = getattr(record, name)
+            options = {"default": value, "help": f"default {value}", **how}
+            add("--" + name.replace("_", "-"), type=type(value), **options)
+
+    add = command("collect", run_collect, "simulate pokes and write them to a folder of shards (needs pybullet)",
+                  "--seed", "--jobs", "--json")
+    add("out", help="folder; one that holds a part of the same pokes is completed")
+    add("--pokes", type=int, default=1000)
+    add("--objects", type=int, nargs=2, metavar=("MIN", "MAX"), default=(settings.objects_min, settings.objects_max),
+        help="objects in a scene, 1 to 7")
+    add("--size", type=int, nargs=2, metavar=("W", "H"), default=(settings.width, settings.height),
+        help=f"of the pictures, px, 4:3 ({settings.width} {settings.height})")
+    add("--kinds", nargs="+", default=settings.kinds, help=f"of {', '.join(KINDS)}")
+    add("--textures", nargs="+", default=settings.textures, help=f"of {', '.join(TEXTURES)}")
+
+    add = command("train", run_train, "train the full model (Eq. 6) on a folder of shards, without labels",
+                  "--jobs", "--json")
+    add("data", nargs="?", default=data_small() / "train")
+    add("out", help="checkpoint to write (.npz); its log goes beside it (.csv and .png)")
+    add_fields(add, recipe, "steps", "batch", "learning_rate", "optimiser", "seed", default=None)
+    add_fields(add, recipe.sizes, "masks", "width", default=None)
+    add("--weight", type=term_weight, action="append", metavar="TERM=VALUE",
+        help=f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(recipe.weights)}")
+    add("--depth-noise", type=float, help="SD in m of the noise to train under (0)")
+    add("--resume", action="store_true", help="go on with the checkpoint OUT and its recipe")
+
+    command("evaluate", run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped "
+            "ones", "checkpoint", "data", "--json")
+    add = command("show", run_show, "one interaction as a picture; without arguments, a shipped one", "checkpoint",
+                  "data")
+    add("--row", type=int, help="which interaction (one that moves something well)")
+    add("--out", default="interaction.png")
+
+    add = command("plan", run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)",
+                  "checkpoint", "--json")
+    add("--seed", type=int, default=0, help=f"which scene ({tables.TRAIN_SEED} has objects that were trained on)")
+    add("--objects", type=int, default=1, choices=(1, 2, 3), help="how many are to be moved")
+    add("--obstacle", action="store_true", help="a scene with another object in the way")
+    add("--mark", type=float, nargs=2, action="append", metavar=("X", "Y"),
+        help="a pixel on an object, again for each; with as many --goal, in place of the scene's")
+    add("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), help="where that shall go")
+    add("--click", action="store_true", help="choose marks and goals in a window")
+    add("--policy", choices=control.POLICIES, default="learned")
+    add("--budget", type=int, default=10, help="pokes at most")
+    add_fields(add, planning.Search(), *SEARCH_OPTIONS)
+    add("--out", default="runs/plan", help="folder for plan.gif, cem.png and the record plan.npz")
+
+    add = command("reproduce", run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it "
+                  "can be stopped and started again (needs pybullet)", "--jobs", "--json")
+    add("table", choices=[*tables.TABLES, "all", "planning"],
+        help="all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G")
+    add("--checkpoint", help="the model to plan with (the shipped one)", default=data_small() / "checkpoint.npz")
+    add("--quick", action="store_true", help="the same tables from little data, in under ten minutes")
+    add("--out", help="folder of data and runs (runs/reproduce, runs/reproduce-quick)")
+
+    add = command("demo", run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, "
+                  "train, evaluate and show on the shipped pokes", "--seed", "--jobs", "--json")
+    add("--out", default="runs/demo")
+    return parser
+
+
+def main(arguments=None):
+    """Run one command; wrong input ends in one line and exit status 2."""
+    args = build_parser().parse_args(arguments)
+    try:
+        args.function(args)
+    except (ValueError, RuntimeError, OSError, FloatingPointError) as error:
+        print(f"hind4sight {args.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nhind4sight {args.command}: stopped; what is on disk is whole", file=sys.stderr)
+        return 130
+    return 0

@@ -1,0 +1,308 @@
+"""The control experiment: tasks with a start and a goal, the closed loop, and the planners it is measured against.
+
+Paper: Sec. IV-G. The simulator's truth sets the goals and measures. Planners go by pictures alone, but for the oracle,
+which tries its pokes out in the simulator. One thing they are all told that no picture shows: before the finger comes
+down, Bullet is asked whether its way is free (`carry_out`). The first start of a poke where it is gets used; where it
+is nowhere free, the poke is spent.
+"""
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import numpy as np
+
+from .. import check_whole
+from ..files import load_npz, save_npz
+from ..geometry import project, unproject
+from ..interactions import occupied_grid
+from ..networks import predict
+from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll,
+                        view_of)
+from ..scene import scene_of
+from ..sim.arena import Arena, Settings
+from ..sim.truth import rotation_from_quaternion, true_scene_flow
+from ..training import check_camera
+from .marks import follow, places_at, points_at
+
+FORMAT = "hind4sight_min plan 1"
+SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
+IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
+FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
+REACHED = 0.4  # cost below which the goal counts as reached: less than followed marks and pixels can tell
+GAIN = 0.05  # of the cost; a poke that is predicted to bring less is not worth its risk
+TURN = np.pi / 4  # rad; goals are turned by at most this
+POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
+
+
+# --- tasks ----------------------------------------------------------------------------------------------------------
+
+@dataclass
+class Task:
+    """A scene in its arena and a goal.
+
+    movers, marked (M,): which objects are to move, and which have a marked point: those, and perhaps one that shall stay.
+    marks, goal_marks (M, 2) px: where these points are and shall be. goal: (rgb, depth) of the goal, or None where the
+    user only said where the marks shall go. goal_poses (7, 7): as Arena.poses; truth, to measure by.
+    """
+    arena: Arena
+    movers: np.ndarray
+    marked: np.ndarray
+    marks: np.ndarray
+    goal_marks: np.ndarray
+    goal_poses: np.ndarray
+    goal: tuple = None
+
+    @property
+    def settings(self):
+        """The arena's Settings as a dict."""
+        return asdict(self.arena.settings)
+
+
+@contextmanager
+def random_task(seed, movers, obstacle=False, settings=SETTINGS):
+    """The fixed test task of a seed: three or four objects, `movers` of them to be moved by 8 to 14 cm and turned.
+
+    obstacle: one object to be moved by 18 cm, and another one half-way, across half of it, that is marked to stay.
+    Draws scenes until the goal is one that the objects can be in: apart from each other, in sight, inside the walls.
+    """
+    if obstacle and movers != 1:
+        raise ValueError(f"movers: expected 1 with an obstacle, got {movers}")
+    check_whole("seed", seed, 0)
+    rng = np.random.default_rng([seed, movers, obstacle])
+    with Arena(settings, rng) as arena:
+        for _ in range(200):
+            arena.new_scene()
+            task = _draw_goal(arena, movers, obstacle, rng)
+            if task:
+                yield task
+                return
+        raise ValueError(f"task: no scene for {movers} objects to move was found")
+
+
+def _draw_goal(arena, movers, obstacle, rng):
+    """A Task for the scene that stands in the arena, or None where the goal that was drawn cannot be."""
+    if obstacle and not _line_up(arena, rng):
+        return None
+    start, poses = arena.snapshot(), arena.poses()
+    chosen = np.arange(1) if obstacle else rng.permutation(len(arena.bodies))[:movers]
+    if len(chosen) < movers or not _set_goal(arena, chosen, rng, -poses[0, :2] if obstacle else None):
+        return None
+    (rgb, depth, labels), goal_poses = arena.observe(), arena.poses()
+    arena.restore(start)
+    _, depth_now, labels_now = arena.observe()
+    if any(np.sum(picture == i + 1) < 12 for picture in (labels, labels_now) for i in range(len(arena.bodies))):
+        return None  # hardly in sight
+    marked = np.append(chosen, 1) if obstacle else chosen
+    marks = np.array([_mark(labels_now, depth_now, arena.camera, i) for i in marked])
+    points = unproject(depth_now, arena.camera)[marks[:, 1], marks[:, 0]]
+    goal_marks = project(carried(points, marked, poses, goal_poses), arena.camera)
+    return Task(arena, chosen, marked, marks, goal_marks, goal_poses, (rgb, depth))
+
+
+def marked_task(task, marks, goal_marks):
+    """The scene of a task with marks and goals of the user's own, (M, 2) px each -> Task without a goal picture.
+
+    Raises ValueError for marks that are not on objects and goals outside the walls, which no object can reach.
+    """
+    arena = task.arena
+    rgb, depth, labels = arena.observe()
+    points = points_at(marks, scene_in(arena, rgb, depth), arena.camera)
+    there = places_at(goal_marks, points[:, 2], arena.camera, task.settings)
+    marks, goal_poses = np.rint(marks).astype(int), arena.poses()
+    movers = labels[marks[:, 1], marks[:, 0]].astype(int) - 1
+    goal_poses[movers, :2] += there - points[:, :2]
+    return Task(arena, movers, movers, marks, np.asarray(goal_marks, np.float32), goal_poses)
+
+
+def _line_up(arena, rng):
+    """Put object 0 on one side, object 1 half across the way to the other; are all others out of the way?"""
+    angle = rng.uniform(-np.pi, np.pi)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    beside = np.array([-along[1], along[0]]) * rng.choice([-1, 1]) * sum(arena.radii[:2]) * IN_THE_WAY
+    arena.put(0, 0.09 * along)
+    arena.put(1, beside)
+    others = arena.poses()[2:len(arena.bodies), :2]
+    apart = np.linalg.norm(others[:, None] - [0.09 * along, beside, -0.09 * along], axis=2).min(initial=1)
+    return apart > 0.09 and sum(arena.radii[:2]) < 0.085 and arena.settle()
+
+
+def _set_goal(arena, movers, rng, opposite=None):
+    """Put the movers where they shall be -> whether they can stand there."""
+    half, poses = arena.settings.arena / 2 * arena.settings.place_within, arena.poses()
+    places = {i: pose[:2] for i, pose in enumerate(poses[:len(arena.bodies)]) if i not in movers}
+    for i in movers:
+        for _ in range(50):
+            angle, length = rng.uniform(-np.pi, np.pi), rng.uniform(*FAR)
+            xy = poses[i, :2] + length * np.array([np.cos(angle), np.sin(angle)]) if opposite is None else opposite
+            if np.abs(xy).max() < half and all(np.linalg.norm(xy - place) > arena.radii[i] + arena.radii[j] + 0.01
+                                               for j, place in places.items()):
+                break
+        else:
+            return False
+        places[i] = xy
+        arena.put(i, xy, rng.uniform(-TURN, TURN))
+    wanted = [places[i] for i in sorted(places)]
+    return arena.settle() and np.abs(arena.poses()[:len(places), :2] - wanted).max() < 0.01
+
+
+def _mark(labels, depth, camera, index):
+    """The pixel (x, y) a user would mark on an object: of its top, the one nearest to the middle."""
+    rows, columns = np.nonzero(labels == index + 1)
+    points = unproject(depth, camera)[rows, columns]
+    top = points[:, 2] > points[:, 2].max() - 0.006
+    away = np.linalg.norm(points[:, :2] - points[top, :2].mean(axis=0), axis=1) + 10 * ~top
+    return np.array([columns[away.argmin()], rows[away.argmin()]])
+
+
+def carried(points, objects, before, after):
+    """Where points (M, 3) m on the objects of these indices (M,) are once these went from poses `before` to `after`."""
+    flow = true_scene_flow(np.asarray(points, np.float64), np.asarray(objects) + 1, before, after)
+    return (points + flow).astype(np.float32)
+
+
+# --- planners -------------------------------------------------------------------------------------------------------
+
+def oracle_rollout(arena, view, labels, settings):
+    """The simulator as a rollout: every sequence is carried out, and undone. labels (N + M,): truth."""
+    start, poses = arena.snapshot(), arena.poses()
+
+    def step(clouds, pokes):
+        place = first_start(possible_starts(pokes, occupied_grid(clouds, view.occupied, settings), settings))[0]
+        if np.isfinite(place).all():
+            arena.poke(pokes[0], place)
+        return (view.cloud + true_scene_flow(view.cloud, labels, poses, arena.poses()))[None]
+
+    def rollout(sequences):
+        found = []
+        for sequence in sequences:
+            arena.restore(start)
+            found.append(roll(step, view, sequence[None], settings))
+        arena.restore(start)
+        return tuple(np.concatenate(each) for each in zip(*found))
+    return rollout
+
+
+def greedy_poke(view, goal, camera, settings, rng):
+    """Push the mark that is farthest from its goal straight at it -> a sequence of one poke (1, 3)."""
+    marks = view.marks.astype(float)
+    away = places_at(goal.pixels, marks[:, 2], camera, settings) - marks[:, :2]
+    far = np.linalg.norm(away, axis=1).argmax()
+    length = np.linalg.norm(away[far])
+    target = marks[far, :2] + away[far] / length * min(0.02, length - 0.03)
+    grid = occupied_grid(view.cloud[None], view.occupied, settings)
+    for turn in np.radians([0, 15, -15, 30, -30, 45, -45]):
+        poke = np.float32([[*target, np.arctan2(away[far, 1], away[far, 0]) + turn]])
+        if np.isfinite(possible_starts(poke, grid, settings)).any():
+            return poke
+    return draw_pokes(rng, 1, view, settings)[0]
+
+
+def next_plan(policy, task, view, labels, goal, run, search, rng, on_iteration=None):
+    """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle."""
+    arena, settings = task.arena, task.settings
+    if policy in ("random", "greedy"):
+        pokes = (draw_pokes(rng, 1, view, settings)[0] if policy == "random"
+                 else greedy_poke(view, goal, arena.camera, settings, rng))
+        return Plan(pokes, None, np.nan, np.nan)
+    if policy == "oracle":
+        rollout = oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings)
+    else:
+        step = learned_step(run, view) if policy == "learned" else lambda clouds, pokes: clouds
+        rollout = partial(roll, step, view, settings=settings)
+    return plan(rollout, view, goal, arena.camera, settings, search, rng, on_iteration)
+
+
+# --- the closed loop ------------------------------------------------------------------------------------------------
+
+def scene_in(arena, rgb, depth):
+    """One picture of an arena -> Scene."""
+    return scene_of(depth[None], rgb[None], arena.empty_depth, arena.camera, arena.settings.arena)
+
+
+def first_look(task):
+    """A task as the robot meets it -> (rgb, depth, labels) of Arena.observe, planning.View, planning.Goal."""
+    observed = task.arena.observe()
+    scene = scene_in(task.arena, *observed[:2])
+    view = view_of(scene, points_at(task.marks, scene, task.arena.camera))
+    return observed, view, goal_of(task.goal_marks, task.goal and scene_in(task.arena, *task.goal))
+
+
+def carry_out(arena, view, poke, settings):
+    """Poke (3,) from the first start that pictures allow and Bullet finds free -> that start (2,) m, NaN if none is."""
+    starts = possible_starts(poke[None], occupied_grid(view.cloud[None], view.occupied, settings), settings)[0]
+    for start in starts[np.isfinite(starts[:, 0])]:
+        if arena.descent_is_free(*start):
+            arena.poke(poke, start)
+            return start
+    return np.full(2, np.nan)
+
+
+def distances(poses, task):
+    """How far the movers are from their goals: places in m, (M,), and orientations about the vertical in rad, (M,), NaN
+    for round ones.
+    """
+    here, there = poses[task.movers], task.goal_poses[task.movers]
+    turn = np.einsum("mij,mkj->mik", rotation_from_quaternion(here[:, 3:]), rotation_from_quaternion(there[:, 3:]))
+    angle = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
+    angle[[task.arena.kinds[i] == "can" for i in task.movers]] = np.nan
+    return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
+
+
+def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None):
+    """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent -> a dict.
+
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
+    Of T pokes: rgb (T+1, H, W, 3), depth (T+1, H, W), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance
+    (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task
+    movers, goal_marks, goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
+    first poke is possible; later on that ends the loop, as an empty arena does.
+    """
+    if policy not in POLICIES:
+        raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
+    check_whole("budget", budget, 1)
+    arena, rng = task.arena, np.random.default_rng(seed)
+    check_camera(run, arena.camera)
+    (rgb, depth, labels), view, goal = first_look(task)
+    states, pokes, starts = [(rgb, depth, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
+    while len(pokes) < budget:
+        try:
+            found = next_plan(policy, task, view, labels, goal, run, search, rng, on_iteration)
+        except NoPoke:
+            if not pokes:
+                raise
+            break
+        if found.now < REACHED or found.cost > found.now - GAIN:
+            break
+        pokes.append(found.pokes[0])
+        starts.append(carry_out(arena, view, pokes[-1], task.settings))
+        (rgb, depth, labels), marks = arena.observe(), view.marks
+        scene = scene_in(arena, rgb, depth)
+        if np.isfinite(starts[-1]).all():
+            marks = follow(view, predict(run.params, run.recipe.sizes, view.scene, pokes[-1][None]), scene)
+        states.append((rgb, depth, arena.poses(), marks, *distances(arena.poses(), task)))
+        if not scene.occupied.any():  # the last object left the arena
+            break
+        view = view_of(scene, marks)
+    record = dict(zip(("rgb", "depth", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
+    return {**record, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
+            "movers": task.movers, "goal_marks": task.goal_marks, **({"goal_rgb": task.goal[0]} if task.goal else {})}
+
+
+def save_record(path, record, meta):
+    """Write what `closed_loop` returned, whole or not at all; meta: seed, movers, obstacle of the task, for `replay`."""
+    save_npz(path, record, {"format": FORMAT, **meta})
+
+
+def replay(path, settings=SETTINGS):
+    """Carry out the pokes of a saved record in a fresh arena -> poses (T+1, 7, 7), those of the record.
+
+    Bullet repeats itself to within some micrometres, unless objects collide with objects: that may amplify.
+    """
+    record, meta = load_npz(path, FORMAT)
+    with random_task(meta["seed"], meta["movers"], meta["obstacle"], settings) as task:
+        poses = [task.arena.poses()]
+        for poke, start in zip(record["pokes"], record["starts"]):
+            if np.isfinite(start).all() and task.arena.descent_is_free(*start):
+                task.arena.poke(poke, start)
+            poses.append(task.arena.poses())
+    return np.stack(poses)

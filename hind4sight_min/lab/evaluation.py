@@ -1,0 +1,211 @@
+"""Metrics, with the unit in the name, beside the no-motion baseline and chance. Paper: Sec. IV-C to IV-F.
+
+This file reads the simulator's truth; training does not.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry import optical_flow, unproject
+from ..interactions import cell_centres
+from ..networks import Prediction, inverse_model, predict, softmax
+from ..scene import Scene, most_changed
+from ..sim.truth import true_scene_flow
+from ..training import scenes_of
+from .noise import with_depth_noise
+
+MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
+AT_WALL = 0.012  # m; a poke ends at a wall where a point that it moved ends so near to one, about a pixel
+
+
+# --- what the model says of one poke ---------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Answer:
+    """The whole model on one poke: the Scenes it saw, (1, N, ...); its Prediction; optical flow (H, W, 2) px; start and
+    end heat-maps (cells,), each summing to 1.
+    """
+    before: Scene
+    after: Scene
+    prediction: Prediction
+    flow: np.ndarray
+    heatmaps: tuple
+
+
+def ask(run, interactions, row, depth_noise=0.0):
+    """The whole model on one row of a data set -> Answer. depth_noise: SD in m of the noise it sees the depth with, the
+    same at every call, another for every row.
+    """
+    one = interactions[[row]]
+    if depth_noise:
+        one = with_depth_noise(one, depth_noise, np.random.default_rng([0, row]))
+    before, after = scenes_of(one)
+    prediction = predict(run.params, run.recipe.sizes, before, one.pokes)
+    flow = optical_flow(before.points, prediction.points, one.camera).reshape(before.images.shape[1:3] + (2,))
+    logits = inverse_model(run.params, *most_changed(before, after), cell_centres(one.settings))
+    return Answer(before, after, prediction, flow, tuple(softmax(each)[0] for each in logits))
+
+
+PEAK = 0.08  # m; how far from its best cell the end map's mean looks: on validation pokes 1.9 cm off, the best cell 2.5
+
+
+def poke_from_heatmaps(start_heatmap, end_heatmap, settings):
+    """Two heat-maps (cells,) -> the poke (3,) they name. Paper: Sec. III-E.
+
+    The target is the mean of the end map around its best cell, finer than a cell; the direction is that of the mean,
+    over the start map, of the unit vectors to the target. A best start cell would give it in steps; the mean is finer
+    and minds no wide map.
+    """
+    centres = cell_centres(settings)
+    near = end_heatmap * (np.linalg.norm(centres - centres[end_heatmap.argmax()], axis=1) < PEAK)
+    target = near @ centres / near.sum()
+    offsets = target - centres
+    mean = start_heatmap @ (offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9))
+    return np.array([*target, np.arctan2(mean[1], mean[0])])
+
+
+# --- the errors of one poke ----------------------------------------------------------------------------------------
+
+def true_motion(interactions, truth, row):
+    """What really happened in one interaction, from its depth without noise.
+
+    -> true scene flow (N, 3) m, true optical flow (N, 2) px, and which points have depth and move, (N,) bool.
+    """
+    depth = interactions.depth_before[row]
+    points = unproject(depth, interactions.camera)
+    flow = true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
+    pixels = optical_flow(points, points + flow, interactions.camera)
+    moving = (depth > 0) & (np.linalg.norm(flow, axis=2) > MOVING)
+    return flow.reshape(-1, 3), pixels.reshape(-1, 2), moving.ravel()
+
+
+def matched_iou(masks, labels, moved):
+    """IoU of each moved object with the predicted mask that the best one-to-one matching gives it.
+
+    masks (N, K) soft, 0 = background; labels (N,) int; moved: the labels of the moved objects -> (len(moved),).
+    A pixel belongs to its largest mask. An object without a mask scores 0.
+    """
+    from scipy.optimize import linear_sum_assignment  # here: it takes as long to import as all the rest
+    hard = np.argmax(masks, axis=1)
+    iou = np.zeros((len(moved), masks.shape[1] - 1))
+    for i, label in enumerate(moved):
+        for k in range(1, masks.shape[1]):
+            union = np.count_nonzero((labels == label) | (hard == k))
+            iou[i, k - 1] = np.count_nonzero((labels == label) & (hard == k)) / max(union, 1)
+    rows, columns = linear_sum_assignment(-iou)
+    result = np.zeros(len(moved))
+    result[rows] = iou[rows, columns]
+    return result
+
+
+def poke_errors(poke, true_poke):
+    """Of pokes (..., 3): distance of the targets in m, angle between the directions in rad, in [0, pi]."""
+    turn = np.asarray(poke)[..., 2] - np.asarray(true_poke)[..., 2]
+    return (np.linalg.norm(np.asarray(poke)[..., :2] - np.asarray(true_poke)[..., :2], axis=-1),
+            np.abs((turn + np.pi) % (2 * np.pi) - np.pi))
+
+
+def errors_of_poke(run, interactions, truth, row, depth_noise=0.0):
+    """All errors of one poke -> dict: sums over its moving, its still and all its points (m, px, m^2), and counts;
+    iou: of each object that moved; poke: as the inverse model names it; at_wall: whether something ended at a wall.
+    """
+    answer = ask(run, interactions, row, depth_noise)
+    points, seen = answer.before.points[0], answer.before.valid[0]
+    true, true_pixels, moving = true_motion(interactions, truth, row)
+    labels = truth.labels[row].ravel()
+    moved = [label for label in np.unique(labels[moving]) if label > 0]
+    error = np.linalg.norm(answer.prediction.points[0] - points - true, axis=1)
+    pixel_error = np.linalg.norm(answer.flow.reshape(-1, 2) - true_pixels, axis=1)
+    length, pixel_length = np.linalg.norm(true, axis=1), np.linalg.norm(true_pixels, axis=1)
+    clean = unproject(interactions.depth_before[row], interactions.camera).reshape(-1, 3)
+    ends = np.abs((clean + true)[moving, :2])
+    return {"moving": moving.sum(), "still": (seen & ~moving).sum(), "error": error[moving].sum(),
+            "length": length[moving].sum(), "drift": error[seen & ~moving].sum(),
+            "squared_error": (error[moving] ** 2).sum(), "squared_motion": (length[moving] ** 2).sum(),
+            "optical": pixel_error[moving].sum(), "optical_zero": pixel_length[moving].sum(),
+            "optical_all": pixel_error[seen].sum(), "optical_zero_all": pixel_length[seen].sum(),
+            "iou": matched_iou(answer.prediction.masks[0], labels, moved),
+            "poke": poke_from_heatmaps(*answer.heatmaps, interactions.settings),
+            "at_wall": bool(ends.size) and ends.max() > interactions.settings["arena"] / 2 - AT_WALL}
+
+
+# --- the summary -------------------------------------------------------------------------------------------------------
+
+def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
+    """All metrics on a data set -> flat dict of floats; see `summary`. depth_noise: SD in m of noise on the depth that
+    the model sees. progress(done, total) is called after every poke.
+    """
+    pokes = []
+    for row in range(len(interactions)):
+        pokes.append(errors_of_poke(run, interactions, truth, row, depth_noise))
+        if progress:
+            progress(row + 1, len(interactions))
+    return summary(pokes, interactions.pokes, scenes_of_pokes(truth))
+
+
+def scenes_of_pokes(truth):
+    """Which scene each poke was made in, (M,) int: a scene goes on while its objects lie where the last poke left them."""
+    fresh = np.any(truth.poses_before[1:] != truth.poses_after[:-1], axis=(1, 2))
+    return np.concatenate([[0], np.cumsum(fresh)])
+
+
+def ratio_of(squared, motion, scenes):
+    """Squared error over squared motion, both (M,), summed over pokes, and the ratio's standard error: by how much as
+    many other scenes (M,) would change it (delta method; pokes of a scene are not independent). Not in the paper.
+
+    NaN where nothing moved.
+    """
+    if not np.sum(motion) > 0:
+        return float("nan"), float("nan")
+    ratio = np.sum(squared) / np.sum(motion)
+    return ratio, np.sqrt(np.sum(np.bincount(scenes, squared - ratio * motion) ** 2)) / np.sum(motion)
+
+
+def summary(pokes, true_pokes, scenes):
+    """The dicts of `errors_of_poke`, the true pokes (M, 3) and their scenes (M,) -> all metrics, a flat dict of floats.
+
+    flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
+    an interaction in which nothing moved has no moving point and so no say in it (it still counts for
+    still_epe_cm). The same for pokes that moved one object (single_), two or more (multi_), ended at a wall (wall_), and
+    without the hundredth of the pokes with the largest squared errors (trimmed_). flow_mse_cm2, flow_rmse_cm,
+    flow_epe_cm: over moving points; no_motion_* the same for predicting no motion. still_epe_cm: mean drift of points
+    that do not move; all_epe_cm: of all points. mask_iou: mean over the objects that moved. optical_epe_px: over moving
+    points; optical_epe_all_px: over all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a
+    poke drawn from the set at random. Raises ValueError where nothing moved at all.
+    """
+    of = {name: np.array([poke[name] for poke in pokes], float) for name in pokes[0] if name not in ("iou", "poke")}
+    total = {name: values.sum() for name, values in of.items()}
+    if not total["moving"]:
+        raise ValueError("interactions: nothing moved in any of them, so there is nothing to measure")
+    moving, everything = total["moving"], total["moving"] + total["still"]
+    objects, squared, motion = np.array([len(poke["iou"]) for poke in pokes]), of["squared_error"], of["squared_motion"]
+    result = {
+        "flow_mse_cm2": 1e4 * squared.sum() / moving,
+        "flow_rmse_cm": 100 * np.sqrt(squared.sum() / moving),
+        "flow_epe_cm": 100 * total["error"] / moving,
+        "still_epe_cm": 100 * total["drift"] / max(total["still"], 1),
+        "all_epe_cm": 100 * (total["error"] + total["drift"]) / everything,
+        "no_motion_mse_cm2": 1e4 * motion.sum() / moving,
+        "no_motion_rmse_cm": 100 * np.sqrt(motion.sum() / moving),
+        "no_motion_epe_cm": 100 * total["length"] / moving,
+        "mask_iou": np.mean(np.concatenate([poke["iou"] for poke in pokes])),
+        "optical_epe_px": total["optical"] / moving,
+        "no_motion_optical_epe_px": total["optical_zero"] / moving,
+        "optical_epe_all_px": total["optical_all"] / everything,
+        "no_motion_optical_epe_all_px": total["optical_zero_all"] / everything,
+        "pokes": len(pokes), "pokes_moved": np.count_nonzero(objects),
+    }
+    usual = squared <= np.quantile(squared, 0.99)
+    for group, of_group in (("", objects >= 0), ("single_", objects == 1), ("multi_", objects > 1),
+                            ("wall_", of["at_wall"] > 0), ("trimmed_", usual)):
+        ratio, error = ratio_of(squared[of_group], motion[of_group], scenes[of_group])
+        result.update({f"{group}flow_mse_ratio": ratio, f"{group}flow_mse_ratio_se": error})
+        if group:
+            result[f"{group}pokes"] = np.count_nonzero(of_group & (objects > 0))
+    found, true_pokes = np.stack([poke["poke"] for poke in pokes])[objects > 0], true_pokes[objects > 0]
+    shuffled = true_pokes[np.random.default_rng(0).permutation(len(true_pokes))]
+    for suffix, guess in (("", found), ("_chance", shuffled)):
+        target, direction = poke_errors(guess, true_pokes)
+        result[f"inverse_target{suffix}_cm"] = 100 * np.median(target)
+        result[f"inverse_direction{suffix}_deg"] = np.degrees(np.median(direction))
+    return {name: float(value) for name, value in result.items()}

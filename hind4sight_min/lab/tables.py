@@ -1,0 +1,368 @@
+"""The paper's tables at our scale: which models, on what data, for how long; runs that go on where they were.
+
+Paper: Sec. IV, Tables I to III, and the control experiment of Sec. IV-G. Every cell of a table is a training run with a
+budget of its own, on one core; what is finished leaves its figures in a file and is never run again.
+"""
+import json
+import subprocess
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from itertools import product
+from multiprocessing import active_children
+from pathlib import Path
+
+import numpy as np
+
+from .. import check_whole, planning, training
+from ..files import plain, write_json
+from ..interactions import load_interactions
+from ..sim.arena import Settings
+from ..sim.collection import collect
+from ..sim.objects import HELD_OUT
+from ..sim.truth import load_truth
+from . import control, evaluation, image_pairs, se3nets
+from .noise import under_noise
+from .processes import pool_map, worker_pool
+from .runs import train_saving
+
+
+@dataclass(frozen=True)
+class Scale:
+    """train_pokes, test_pokes: how many. steps: of every cell of the tables; long_steps: of the headline models."""
+    train_pokes: int = 24000
+    test_pokes: int = 1000
+    steps: int = 3000
+    long_steps: int = 20000
+    seeds: tuple = (1, 2, 3)
+
+
+FULL = Scale()
+QUICK = Scale(train_pokes=600, test_pokes=100, steps=200, long_steps=300, seeds=(1, 2))
+
+_2D = {name: training.WEIGHTS[name] for name in ("photometric", "flow_smoothness")}
+_3D = {name: training.WEIGHTS[name] for name in ("chamfer", "distance_smoothness")}
+
+NOISES = {"clean": 0.0, "noisy": 0.01}  # m, SD of the depth noise in training and test
+
+# name -> (what the table says, weights, window in pixels of SE3-Nets' association noise, flow MSE in the paper's Table I
+# without and with noise). SE3-Nets is our network with its loss. The paper gives windows of 9 and 11 pixels but not the
+# picture's size; SE3-Nets' has 320 columns, five times ours, where they span what 3 pixels do here. Both are shown.
+# The paper prints "MSE (cm)". We read its numbers as squared errors in cm^2, as the name says; read as lengths, it is
+# our flow_epe_ratio that they have to be held against.
+MODELS = {
+    "se3nets_0": ("SE3-Nets, exact association", se3nets.WEIGHTS, 1, (1.00, 1.07)),
+    "se3nets_9": ("SE3-Nets, 9 x 9 px", se3nets.WEIGHTS, 9, (1.68, 1.94)),
+    "se3nets_11": ("SE3-Nets, 11 x 11 px", se3nets.WEIGHTS, 11, (2.07, 2.20)),
+    "se3nets_3": ("SE3-Nets, 3 x 3 px (11 x 11 scaled)", se3nets.WEIGHTS, 3, ()),
+    "2d": ("2D loss", _2D, None, (1.86, 1.93)),
+    "3d": ("3D loss", _3D, None, (1.80, 31.39)),
+    "2d_3d": ("2D loss + 3D loss", {**_2D, **_3D}, None, (1.52, 1.78)),
+    "full": ("full model", training.WEIGHTS, None, (1.47, 1.63)),
+}
+NO_MOTION_PAPER = 12.6  # Table II, cm^2
+OPTICAL_PAPER, PEER_PAPER = "0.05", "0.11"  # Table III, px; the peer is FlowNet 2.0
+
+TABLES = {"flow": [name for name in MODELS if name.startswith("se3nets")] + ["full"],
+          "ablation": ["2d", "3d", "2d_3d", "full"], "optical-flow": []}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run: a model, a noise and a seed, for the budget of the tables or the long one of the headlines."""
+    model: str
+    noise: str
+    seed: int
+    long: bool = False
+
+    @property
+    def group(self):
+        """What the runs of all seeds have in common, as the figures' names say it."""
+        return f"{self.model}_{self.noise}" + ("_long" if self.long else "")
+
+
+def cells_of_tables(tables, scale):
+    """The cells that some tables need, each once; the long runs of the full model are the headlines of all of them."""
+    cells = []
+    for seed in scale.seeds:  # so that one seed of everything is there first
+        cells += [Cell("full", noise, seed, long=True) for noise in NOISES]
+        cells += [Cell(model, noise, seed) for table in tables for model in TABLES[table] for noise in NOISES]
+    return list(dict.fromkeys(cells))
+
+
+def recipe_of(cell, scale):
+    """The Recipe of a cell."""
+    return training.Recipe(steps=scale.long_steps if cell.long else scale.steps, seed=cell.seed,
+                           weights=dict(MODELS[cell.model][1]))
+
+
+def objective_of(cell):
+    """The objective of a cell, for `training.train`; that of SE3-Nets takes `se3nets.Supervised` data."""
+    noise, window = NOISES[cell.noise], MODELS[cell.model][2]
+    if window:
+        return partial(se3nets.supervised, window=window, depth_noise=noise)
+    return partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
+
+
+# --- data ------------------------------------------------------------------------------------------------------
+
+# Also of the shipped checkpoint's pokes. A task of this seed would share its random numbers with a training shard, and
+# so its objects: no scene of the control experiment has it.
+TRAIN_SEED = 5
+
+
+def collect_data(out, scale, map=map, progress=None):
+    """Training pokes, test pokes, and test pokes of objects and textures never trained on; completes what is there."""
+    for name, pokes, seed, settings in (("train", scale.train_pokes, TRAIN_SEED, Settings()),
+                                        ("test", scale.test_pokes, 101, Settings()),
+                                        ("unseen", scale.test_pokes, 102, Settings(**HELD_OUT))):
+        collect(out / name, pokes, seed, settings, map, progress)
+
+
+@lru_cache(maxsize=4)
+def _data(folder):
+    return se3nets.Supervised(load_interactions(folder), load_truth(folder))
+
+
+# --- one cell ----------------------------------------------------------------------------------------------------
+
+@lru_cache
+def commit():
+    """The commit of the package, "-dirty" where files differ from it; None outside a checkout or without git."""
+    try:
+        return subprocess.run(["git", "describe", "--always", "--dirty", "--abbrev=12"], cwd=Path(__file__).parent,
+                              capture_output=True, text=True, check=True).stdout.strip()
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        return None
+
+
+def once(path, made, compute):
+    """The figures in a file; where there is none, those that compute() returns, kept there with what they are made of.
+
+    made: plain JSON types. Raises ValueError for figures that were made of something else.
+    """
+    if not path.exists():
+        began_at = commit()
+        write_json(path, {**made, "metrics": compute(), "commit": began_at})
+    found = json.loads(path.read_text())
+    if any(found.get(name) != value for name, value in made.items()):
+        raise ValueError(f"{path}: made with another recipe, network or search; remove it, or choose another --out")
+    return found["metrics"]
+
+
+def run_cell(cell, out, scale, save_every=60.0):
+    """Train and evaluate one cell, from where it was -> its metrics, with train_seconds. Runs in a worker process.
+
+    `python docs/results.py keep` collects the files of what is finished.
+    """
+    path, recipe, noise = out / "cells" / f"{cell.group}-{cell.seed}.npz", recipe_of(cell, scale), NOISES[cell.noise]
+    window = MODELS[cell.model][2]
+
+    def compute():
+        data = _data(out / "train")
+        run = training.load_run(path) if path.exists() else training.start_run(recipe, data.interactions)
+        if run.recipe != recipe:
+            raise ValueError(f"{path}: made with another recipe; remove it, or choose another --out")
+        run.meta["depth_noise"] = noise
+        train_saving(data if window else data.interactions, run, path, objective_of(cell), save_every=save_every)
+        metrics = evaluation.evaluate(run, **vars(_data(out / "test")), depth_noise=noise)
+        if cell.long and not noise:
+            unseen = evaluation.evaluate(run, **vars(_data(out / "unseen")))
+            metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
+        return {**metrics, "train_seconds": run.meta["seconds"]}
+
+    return once(path.with_suffix(".json"), {
+        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": training.FORMAT,
+        "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes}, compute)
+
+
+# --- all of them ------------------------------------------------------------------------------------------------
+
+def run_all(function, tasks, jobs, report=None):
+    """{task: function(*task)} of tuples, over so many processes; report(done, task, result) is called after each."""
+    results = {}
+    with worker_pool(jobs) as pool:
+        try:
+            for task, result in zip(tasks, pool.map(function, *zip(*tasks))):
+                results[task] = result
+                if report:
+                    report(len(results), task, result)
+        except BaseException:  # an interrupt must not wait for what runs: its files are on disk
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+    return results
+
+
+def reproduce(tables, out, scale, jobs=1, progress=None):
+    """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
+    check_whole("jobs", jobs, 1)
+    out = Path(out)
+    with pool_map(jobs) as map:
+        collect_data(out, scale, map, progress)
+    cells = cells_of_tables(tables, scale)
+
+    def report(done, task, metrics):
+        print(f"{done} of {len(cells)}: {task[0].group}, seed {task[0].seed}: ratio {metrics['flow_mse_ratio']:.3f}, "
+              f"{metrics['train_seconds'] / 60:.1f} min", flush=True)
+
+    results = run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs, report)
+    figures = summarise({cell: results[cell,] for cell in cells}, scale)
+    if "optical-flow" in tables:
+        figures.update(image_pairs.evaluate_image_pairs(**vars(_data(out / "test"))))
+    return figures
+
+
+def summarise(results, scale):
+    """{Cell: metrics} -> mean and SD over the seeds of every metric, and the scale: a flat dict."""
+    figures, groups = asdict(scale), {}
+    for cell, metrics in results.items():
+        groups.setdefault(cell.group, []).append(metrics)
+    for group, seeds in groups.items():
+        for metric in seeds[0]:
+            values = [metrics[metric] for metrics in seeds]
+            figures[f"{group}_{metric}"] = float(np.mean(values))
+            figures[f"{group}_{metric}_sd"] = float(np.std(values, ddof=1))
+    return figures
+
+
+# --- tables ------------------------------------------------------------------------------------------------------
+
+def table(*rows):
+    """Rows of texts as Markdown; the first is the head."""
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def mean_and_sd(figures, key, form="{:.2f}"):
+    """The text "mean +- SD" of a figure, the mean alone where it has no SD, "" for a figure that is not there."""
+    return " \u00b1 ".join(form.format(figures[name]) for name in (key, f"{key}_sd") if name in figures)
+
+
+def flow_table(figures, name):
+    """Table I of the paper, ours beside it: flow MSE, relative to no motion, of every model without and with noise."""
+    rows = [("flow MSE / no motion" + (", ablation" if name == "ablation" else ""), "paper, no noise", "ours, no noise",
+             "paper, 1 cm noise", "ours, 1 cm noise", "ours, cm^2, no noise", "ours, cm^2, 1 cm noise")]
+    for model, long in [(model, "") for model in TABLES[name]] + [("full", "_long")]:
+        paper = [f"{value / NO_MOTION_PAPER:.3f}" for value in MODELS[model][3] if not long] or ["", ""]
+        ratio, mse = ([mean_and_sd(figures, f"{model}_{noise}{long}_{metric}", form) for noise in NOISES]
+                      for metric, form in (("flow_mse_ratio", "{:.3f}"), ("flow_mse_cm2", "{:.2f}")))
+        if any(ratio):
+            text = MODELS[model][0] + (", trained long" if long else "")
+            rows.append((text, paper[0], ratio[0], paper[1], ratio[1], *mse))
+    return table(*rows)
+
+
+def optical_table(figures):
+    """Table III of the paper, ours beside it."""
+    rows = [("optical flow, end-point error", "sees", "paper", "moving pixels, px", "all pixels, px")]
+    for key, *texts in (*((peer, f"{peer} (FlowNet 2.0 in the paper)", "both pictures", PEER_PAPER)
+                          for peer in image_pairs.PEERS),
+                        ("full_clean_long", "full model, trained long", "depth and poke", OPTICAL_PAPER),
+                        ("full_clean_long_no_motion", "no motion", "", "")):
+        rows.append((*texts, mean_and_sd(figures, f"{key}_optical_epe_px"),
+                     mean_and_sd(figures, f"{key}_optical_epe_all_px", "{:.4f}")))
+    return table(*rows)
+
+
+def tables_text(tables, figures):
+    """The asked-for tables as Markdown."""
+    return "\n\n".join(optical_table(figures) if name == "optical-flow" else flow_table(figures, name)
+                       for name in tables)
+
+
+# --- planning (Sec. IV-G) ------------------------------------------------------------------------------------------
+
+# name -> (what the table says, control.POLICIES, what its search changes)
+PLANNERS = {
+    "learned": ("learned model", "learned", {}),
+    "pixels": ("learned model, pixel distance alone", "learned", {"chamfer_weight": 0.0}),
+    "chamfer": ("learned model, Chamfer distance alone", "learned", {"pixel_weight": 0.0}),
+    "oracle": ("the simulator as the model", "oracle", {}),
+    "random": ("random pokes", "random", {}),
+    "no_motion": ("model of no motion", "no_motion", {}),
+}
+OBJECTS, POKES = (1, 2, 3), 10
+OBSTACLE_SCENES, OBSTACLE_TRIES = 3, 5
+AVOIDED = 0.01  # m; an obstacle that was moved by less was avoided
+AHEAD = {"horizon": 2, "candidates": 128}  # getting around an obstacle takes more than one poke
+
+
+def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
+    """One sequence of pokes -> its `outcome`, or that of when it was run before. Runs in a worker process.
+
+    planner: of PLANNERS, or "greedy"; movers 0: an obstacle scene. attempt: another one has other random numbers.
+    """
+    _, policy, changes = PLANNERS.get(planner, ("", planner, {})) if movers else ("", planner, AHEAD)
+    run, search = training.load_run(checkpoint), planning.Search(**changes)
+
+    def compute():
+        with control.random_task(seed, max(movers, 1), obstacle=movers == 0) as task:
+            return outcome(control.closed_loop(task, run, policy, search, POKES, seed=[seed, attempt]))
+
+    return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
+        "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
+        "settings": asdict(control.SETTINGS)}), compute)
+
+
+def outcome(record):
+    """What the tables need of a record of `control.closed_loop` -> dict. distance_m (POKES + 1): mean over the movers
+    after every poke; others_shifted_m: the farthest that any other object was moved from its place; angles_deg: of
+    movers that are not round, at first and at last.
+    """
+    poses, distance, angles = record["poses"][..., :2], record["distance"].mean(axis=1), record["angle"][[0, -1]]
+    others = np.delete(poses, record["movers"], axis=1)
+    return {"distance_m": np.pad(distance, (0, POKES + 1 - len(distance)), "edge").tolist(),  # it stopped: all stays
+            "others_shifted_m": float(np.linalg.norm(others - others[0], axis=2).max()), "pokes": len(record["pokes"]),
+            "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist()}
+
+
+def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
+    """The paper's control experiment -> flat dict of figures, curves {(planner, objects): (scenes, pokes + 1) m}.
+
+    Scenes that were run before, with the same checkpoint and planners, are not run again.
+    """
+    check_whole("jobs", jobs, 1)
+    seeds = [seed for seed in range(scenes + 1) if seed != TRAIN_SEED][:scenes]
+    todo = list(product(PLANNERS, OBJECTS, seeds, [0]))
+    todo += product(("learned", "greedy"), [0], range(OBSTACLE_SCENES), range(OBSTACLE_TRIES))
+    return summarise_planning(run_all(partial(run_scene, checkpoint, Path(out)), todo, jobs))
+
+
+def summarise_planning(results):
+    """{(planner, movers, seed, attempt): outcome} -> flat dict of figures (distance left after all pokes, relative to
+    the start; orientation; obstacles), curves as of `reproduce_planning`.
+    """
+    def of(planner, movers):
+        return [each for key, each in results.items() if key[:2] == (planner, movers)]
+
+    figures, curves = {}, {}
+    for planner, movers in product(PLANNERS, OBJECTS):
+        curve = curves[planner, movers] = np.array([each["distance_m"] for each in of(planner, movers)])
+        found = {"left": curve[:, -1].mean() / curve[:, 0].mean(), "left_sd": (curve[:, -1] / curve[:, 0]).std(ddof=1)}
+        start, end = (np.concatenate([each["angles_deg"][i] for each in of(planner, movers)]) for i in (0, 1))
+        if len(start):
+            found.update(angle_start_deg=np.median(start), angle_deg=np.median(end))
+        figures.update({f"{planner}_{movers}_{name}": float(value) for name, value in found.items()})
+    learned, oracle = (sum(curves[planner, movers][:, -1].mean() for movers in OBJECTS)
+                       for planner in ("learned", "oracle"))
+    figures["plan_over_oracle"] = float(learned / oracle)
+    for planner in ("learned", "greedy"):
+        shifts = np.array([each["others_shifted_m"] for each in of(planner, 0)])
+        figures[f"{planner}_obstacle_avoided"] = float(np.mean(shifts < AVOIDED))
+        figures[f"{planner}_obstacle_shift_cm"] = float(100 * np.mean(shifts))
+    return figures, curves
+
+
+def planning_table(figures):
+    """The control experiment as Markdown: distance left relative to the start, and median orientation error."""
+    rows = [["planner"]]
+    for movers in OBJECTS:
+        rows[0] += [f"{movers} object{'s' * (movers > 1)}: distance left", "turned wrong by, start -> end"]
+    for planner, (text, *_) in PLANNERS.items():
+        rows.append([text])
+        for movers in OBJECTS:
+            start, end = (figures.get(f"{planner}_{movers}_{name}") for name in ("angle_start_deg", "angle_deg"))
+            rows[-1] += [mean_and_sd(figures, f"{planner}_{movers}_left"),
+                         "" if end is None else f"{start:.0f}\u00b0 -> {end:.0f}\u00b0"]
+    return table(*rows)

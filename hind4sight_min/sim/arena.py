@@ -1,0 +1,323 @@
+"""The poke arena in Bullet: scenes, pictures, pokes. Paper: Sec. IV-A and IV-B; sizes, camera and finger are ours.
+
+pybullet is imported only when an Arena is made; everything else in the package works without it.
+"""
+import tempfile
+import time
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+
+from .. import check_whole
+from ..geometry import Camera
+from ..interactions import cell_centres, finger_fits, occupied_grid
+from ..scene import scene_of
+from .objects import KINDS, TEXTURES, draw_shape, draw_texture, mesh, prism
+
+MAX_OBJECTS = 7
+TIME_STEP = 1 / 240  # s
+SUPERSAMPLE = 3  # odd: the middle sample of a block of rays lies on the pixel's centre
+NEAR, FAR = 0.2, 2.0  # m from the camera; the renderer sees what lies between
+PARK_HEIGHT = 1.0  # m; the finger waits up here, out of the camera's sight
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that decides what the simulator draws. Lengths in m, force in N, speed in m/s, pictures in pixels.
+
+    The finger's path has a length within `poke_length`; scenes are thrown away after `pokes_per_scene`.
+    `place_within` is the part of the arena in which a new scene's objects are put down.
+    Raises ValueError naming what cannot work.
+    """
+    objects_min: int = 3
+    objects_max: int = 4
+    kinds: tuple = ("carton", "can", "bracket", "pot")
+    textures: tuple = ("stripes", "checks", "dots", "patches")
+    arena: float = 0.5
+    cell: float = 0.025
+    wall_height: float = 0.03
+    place_within: float = 0.7
+    pokes_per_scene: int = 6
+    poke_length: tuple = (0.10, 0.14)
+    finger_radius: float = 0.01
+    finger_force: float = 25.0
+    finger_speed: float = 0.25
+    width: int = 64
+    height: int = 48
+
+    def __post_init__(self):
+        for name, kind, value in [(field.name, field.type, getattr(self, field.name)) for field in fields(self)]:
+            if kind is int:
+                check_whole(name, value, 1)
+            elif kind is float and not 0 < value < float("inf"):
+                raise ValueError(f"{name}: expected a finite number > 0, got {value}")
+            elif isinstance(value, list):  # JSON has lists where we have tuples
+                object.__setattr__(self, name, tuple(value))
+        cells, length = self.arena / self.cell, self.poke_length
+        paths = isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena
+        for good, name, expected in (
+                (self.objects_min <= self.objects_max <= MAX_OBJECTS, "objects_max", f"objects_min to {MAX_OBJECTS}"),
+                (self.kinds and set(self.kinds) <= set(KINDS), "kinds", f"some of {', '.join(KINDS)}"),
+                (self.textures and set(self.textures) <= set(TEXTURES), "textures", f"some of {', '.join(TEXTURES)}"),
+                (self.arena <= 0.5, "arena", "at most 0.5 m, which the camera sees"),
+                (abs(cells - round(cells)) < 1e-6, "cell", "one that the arena has a whole number of"),
+                (self.place_within <= 1, "place_within", "a share of the arena, at most 1"),
+                (paths, "poke_length", "(least, most) in m, shorter than the arena"),
+                (self.width >= 16 and self.width * 3 == self.height * 4, "width", "4/3 of height, and at least 16")):
+            if not good:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
+
+
+# --- the camera ----------------------------------------------------------------------------------------------------
+
+def look_at(eye, target):
+    """Camera pose (4, 4) arena_from_camera at `eye`, looking at `target` (both (3,), m, arena), z up.
+
+    Not in the paper: it only says that the camera is fixed.
+    Raises ValueError when it would look straight up or down, where "right" is not defined.
+    """
+    eye, target = np.asarray(eye, float), np.asarray(target, float)
+    forward = target - eye
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if not np.linalg.norm(right) > 1e-9:
+        raise ValueError(f"eye, target: expected two points not one above the other, got {eye}, {target}")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return pose
+
+
+def arena_camera(width, height):
+    """The fixed Camera: in front of the arena, looking down at 54 degrees; the same view at any size, in pixels."""
+    focal = height / 2 / np.tan(np.radians(34.5) / 2)
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
+                  look_at([0, -0.46, 0.62], [0, -0.018, 0]))
+
+
+# --- the arena -----------------------------------------------------------------------------------------------------
+
+class Arena:
+    """One Bullet world: a walled table, a finger on three prismatic joints, a camera. A context manager.
+
+    Of the present scene's objects: bodies, Bullet's numbers; kinds; radii, how far their corners lie from the middle,
+    m. empty_depth (H, W) m: the arena without any. bullet: Bullet's functions, for this world; bullet_seconds: spent in
+    stepping and rendering. All is drawn from the Generator `rng`. Raises RuntimeError where pybullet is not installed.
+    """
+
+    def __init__(self, settings, rng):
+        try:
+            import pybullet
+        except ImportError:
+            raise RuntimeError("the simulator needs pybullet, which is not installed: pip install pybullet "
+                               "(ready-made for Python 3.11 and older; later versions compile it)") from None
+        world = pybullet.connect(pybullet.DIRECT)
+        self.bullet = SimpleNamespace(**{name: partial(value, physicsClientId=world) if callable(value) else value
+                                         for name, value in vars(pybullet).items()})
+        self.settings, self.rng, self.camera = settings, rng, arena_camera(settings.width, settings.height)
+        self.bodies, self.kinds, self.radii, self.bullet_seconds = [], [], [], 0.0
+        self._build()
+        self.empty_depth = self.observe()[1]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.bullet.disconnect()
+
+    def _build(self):
+        p, s, c = self.bullet, self.settings, self.camera
+        p.setGravity(0, 0, -9.81)
+        p.setPhysicsEngineParameter(fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1)
+        half, thick, high, white = s.arena / 2, 0.01, s.wall_height / 2, [0.9, 0.9, 0.88, 1]
+        boxes = [([0, 0, -0.02], [1.0, 1.0, 0.02], [0.62, 0.60, 0.56, 1], 0.6)]  # the table, then the walls
+        for sign in (-1, 1):
+            boxes += [([sign * (half + thick), 0, high], [thick, half + 2 * thick, high], white, 0.3),
+                      ([0, sign * (half + thick), high], [half, thick, high], white, 0.3)]
+        for position, size, colour, friction in boxes:
+            body = p.createMultiBody(0, p.createCollisionShape(p.GEOM_BOX, halfExtents=size),
+                                     p.createVisualShape(p.GEOM_BOX, halfExtents=size, rgbaColor=colour), position)
+            p.changeDynamics(body, -1, lateralFriction=friction)
+        self._finger = self._build_finger()
+        self._place_finger(0, 0, PARK_HEIGHT)
+        # Bullet's renderer samples at a pixel's corner; this frustum puts the corners of the fine picture where the
+        # camera model wants the pixel centres.
+        fine, scale = SUPERSAMPLE, NEAR / (c.fx * SUPERSAMPLE)
+        x, y = fine * c.cx + (fine - 1) / 2, fine * c.cy + (fine - 1) / 2
+        self._projection = p.computeProjectionMatrix(-x * scale, (fine * c.width - x) * scale,
+                                                     -(fine * c.height - 1 - y) * scale, (1 + y) * scale, NEAR, FAR)
+        opengl_from_arena = np.diag([1.0, -1, -1, 1]) @ c.camera_from_arena
+        self._view, self._textures = opengl_from_arena.T.ravel().tolist(), []
+        with tempfile.TemporaryDirectory() as folder:
+            for i in range(24):
+                path = str(Path(folder) / f"texture_{i}.png")
+                cv2.imwrite(path, draw_texture(s.textures[i % len(s.textures)], self.rng)[..., ::-1])
+                self._textures.append(p.loadTexture(path))
+
+    def _build_finger(self):
+        """A vertical cylinder that slides along x, y and z: it stalls at its force limit, it cannot tilt."""
+        p, zeros, upright = self.bullet, [[0, 0, 0]] * 3, [[0, 0, 0, 1]] * 3
+        cylinder = p.createCollisionShape(p.GEOM_CYLINDER, radius=self.settings.finger_radius, height=0.2)
+        finger = p.createMultiBody(
+            baseMass=0, basePosition=[0, 0, 0.105],  # the tip is 5 mm above the table when z = 0
+            linkMasses=[0.3] * 3, linkCollisionShapeIndices=[-1, -1, cylinder], linkVisualShapeIndices=[-1] * 3,
+            linkPositions=zeros, linkOrientations=upright, linkInertialFramePositions=zeros,
+            linkInertialFrameOrientations=upright, linkParentIndices=[0, 1, 2],
+            linkJointTypes=[p.JOINT_PRISMATIC] * 3, linkJointAxis=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        p.changeDynamics(finger, 2, lateralFriction=0.3)
+        return finger
+
+    def _place_finger(self, *position):
+        p = self.bullet
+        for joint, value in enumerate(position):
+            p.resetJointState(self._finger, joint, value, 0)
+            p.setJointMotorControl2(self._finger, joint, p.POSITION_CONTROL, targetPosition=value, force=1000)
+
+    def _step(self, count):
+        start, step = time.perf_counter(), self.bullet.stepSimulation
+        for _ in range(count):
+            step()
+        self.bullet_seconds += time.perf_counter() - start
+
+    def settle(self, limit=240):
+        """Step until every object is at rest; False if one still moves after `limit` steps."""
+        for _ in range(limit // 12):
+            self._step(12)
+            if all(np.abs(self.bullet.getBaseVelocity(body)).max() < 0.01 for body in self.bodies):
+                return True
+        return False
+
+    def new_scene(self):
+        """Put down a fresh random set of objects, apart from each other, and let them settle.
+
+        Raises ValueError when they do not fit in 100 tries.
+        """
+        s, rng = self.settings, self.rng
+        for _ in range(100):
+            for body in self.bodies:
+                self.bullet.removeBody(body)
+            self.bodies, self.kinds, self.radii, places = [], [], [], []
+            for _ in range(rng.integers(s.objects_min, s.objects_max + 1)):
+                kind = s.kinds[rng.integers(len(s.kinds))]
+                shape = draw_shape(kind, rng)
+                radius = max(np.linalg.norm(outline, axis=1).max() for outline in shape[0])
+                for _ in range(100):
+                    xy = rng.uniform(-0.5, 0.5, 2) * s.arena * s.place_within
+                    if all(np.linalg.norm(xy - place) > radius + other + 0.004
+                           for place, other in zip(places, self.radii)):
+                        places.append(xy)
+                        self.radii.append(radius)
+                        self.kinds.append(kind)
+                        self.bodies.append(self._add_object(kind, *shape, xy))
+                        break
+            if len(self.bodies) >= s.objects_min and self.settle():
+                return
+        raise ValueError(f"objects: {s.objects_min} do not fit into {s.place_within:.0%} of a {s.arena} m arena")
+
+    def _add_object(self, kind, outlines, area, height, taper, xy):
+        p, rng, (density, friction) = self.bullet, self.rng, KINDS[kind][-2:]
+        if len(outlines) == 1:
+            collision = p.createCollisionShape(p.GEOM_MESH, vertices=prism(outlines[0], height, taper).tolist())
+        else:
+            collision = p.createCollisionShapeArray(
+                shapeTypes=[p.GEOM_BOX] * len(outlines),
+                halfExtents=[[*(corners[2] - corners[0]) / 2, height / 2] for corners in outlines],
+                collisionFramePositions=[[*(corners[0] + corners[2]) / 2, 0] for corners in outlines])
+        vertices, normals, uvs, indices = mesh(outlines, height, taper)
+        visual = p.createVisualShape(p.GEOM_MESH, vertices=vertices, normals=normals, uvs=uvs, indices=indices)
+        mass, angle = density * area * height * (1 + taper + taper ** 2) / 3, rng.uniform(0, 2 * np.pi)
+        body = p.createMultiBody(mass, collision, visual, [*xy, height / 2 + 0.001],
+                                 [0, 0, np.sin(angle / 2), np.cos(angle / 2)])
+        p.changeDynamics(body, -1, lateralFriction=rng.uniform(*friction))
+        p.changeVisualShape(body, -1, textureUniqueId=self._textures[rng.integers(len(self._textures))],
+                            rgbaColor=[1, 1, 1, 1])
+        return body
+
+    def poses(self):
+        """(MAX_OBJECTS, 7) float32: position and quaternion (x, y, z, w) of every object, zeros beyond the last."""
+        result = np.zeros((MAX_OBJECTS, 7), np.float32)
+        for i, body in enumerate(self.bodies):
+            result[i] = np.concatenate(self.bullet.getBasePositionAndOrientation(body))
+        return result
+
+    def put(self, index, xy, turn=0.0):
+        """Lift object `index` over to xy (2,) m and turn it by `turn` rad about the vertical, upright as it stood."""
+        p, body = self.bullet, self.bodies[index]
+        position, quaternion = p.getBasePositionAndOrientation(body)
+        turned = p.multiplyTransforms([0, 0, 0], [0, 0, np.sin(turn / 2), np.cos(turn / 2)], [0, 0, 0], quaternion)[1]
+        p.resetBasePositionAndOrientation(body, [*xy, position[2] + 0.001], turned)
+
+    def snapshot(self):
+        """The state of the world, for `restore`; Bullet keeps it until the arena is closed."""
+        return self.bullet.saveState()
+
+    def restore(self, state):
+        """Bring back the world of a `snapshot` of the same scene."""
+        self.bullet.restoreState(state)
+
+    def observe(self):
+        """Look at the arena -> rgb (H, W, 3) uint8, depth (H, W) float32 m, labels (H, W) uint8 (truth)."""
+        c, fine, start = self.camera, SUPERSAMPLE, time.perf_counter()
+        width, height, rgba, zbuffer, bodies = self.bullet.getCameraImage(
+            fine * c.width, fine * c.height, self._view, self._projection, shadow=0, lightDirection=[0.3, -0.6, 1.0],
+            renderer=self.bullet.ER_TINY_RENDERER)
+        self.bullet_seconds += time.perf_counter() - start
+        rgb = np.reshape(rgba, (height, width, 4)).astype(np.uint8)[..., :3]
+        rgb = cv2.resize(rgb, (c.width, c.height), interpolation=cv2.INTER_AREA)
+        zbuffer, bodies = (np.reshape(each, (height, width))[fine // 2::fine, fine // 2::fine]
+                           for each in (zbuffer, bodies))
+        depth = FAR * NEAR / (FAR - (FAR - NEAR) * zbuffer.astype(float))
+        labels = np.zeros(depth.shape, np.uint8)
+        for i, body in enumerate(self.bodies):
+            labels[bodies == body] = i + 1
+        return rgb, depth.astype(np.float32), labels
+
+    def sample_poke(self, rgb, depth):
+        """A random poke at what background subtraction sees: an occupied cell as target, a free one as start.
+
+        Paper: Sec. IV-A. The picture, (H, W, 3) uint8 and (H, W) m -> poke (3,), start (2,) float32, or None where no
+        start is free.
+        """
+        s, settings = self.settings, asdict(self.settings)
+        scene = scene_of(depth[None], rgb[None], self.empty_depth, self.camera, s.arena)
+        grid, centres = occupied_grid(scene.points, scene.occupied[0], settings), cell_centres(settings)
+        if not grid.any():
+            return None
+        target = centres[self.rng.choice(np.flatnonzero(grid))]
+        length = np.linalg.norm(target - centres, axis=1)
+        possible = finger_fits(centres[None], grid, settings)[0]
+        possible &= (length >= s.poke_length[0]) & (length <= s.poke_length[1])
+        for start in centres[self.rng.permutation(np.flatnonzero(possible))]:
+            if self.descent_is_free(*start):
+                dx, dy = target - start
+                return np.float32([*target, np.arctan2(dy, dx)]), np.float32(start)
+        return None
+
+    def descent_is_free(self, x, y):
+        """Whether the finger can come down at (x, y) m: a tall cylinder, lowered, fills the column of its descent."""
+        self._place_finger(x, y, 0)
+        self.bullet.performCollisionDetection()
+        free = not any(self.bullet.getClosestPoints(self._finger, body, 0.002, linkIndexA=2) for body in self.bodies)
+        self._place_finger(0, 0, PARK_HEIGHT)
+        return free
+
+    def poke(self, poke, start):
+        """Lower the finger at `start` (2,) m, push in a straight line to the target of `poke` (3,), lift it.
+
+        Both axes share the speed in proportion, so the path is straight; each gives up at the force limit.
+        Returns True when everything came to rest.
+        """
+        p, s = self.bullet, self.settings
+        self._place_finger(*start, 0)
+        travel = np.asarray(poke[:2], float) - start
+        length = np.linalg.norm(travel)
+        for joint in (0, 1):
+            p.setJointMotorControl2(self._finger, joint, p.POSITION_CONTROL, targetPosition=float(poke[joint]),
+                                    maxVelocity=abs(travel[joint]) / length * s.finger_speed + 1e-4,
+                                    force=s.finger_force)
+        self._step(int(length / s.finger_speed / TIME_STEP) + 40)  # the last 40 close the final centimetre
+        self._place_finger(0, 0, PARK_HEIGHT)
+        return self.settle()

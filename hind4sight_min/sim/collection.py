@@ -1,0 +1,99 @@
+"""Collection: shards of pokes, each in a Bullet world with its own seed. Paper: Sec. IV-A and IV-B."""
+import time
+from collections import Counter
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from .. import check_whole
+from ..files import plain
+from ..interactions import Interactions, find_shards, load_shard, save_shard
+from .arena import Arena, Settings
+from .truth import Truth, save_truth, truth_path
+
+SHARD_POKES = 100  # one shard is one world, so the data do not depend on who collects it
+
+
+def collect_shard(settings, seed, index, pokes):
+    """Collect one shard -> (Interactions, Truth, seconds inside Bullet). The same arguments give the same data.
+
+    Interactions are dropped, and counted in meta["counts"], when an object left the arena, is out of the camera's
+    sight, or never came to rest. Raises ValueError for settings under which that is nearly always so.
+    """
+    kept, counts = [], Counter(kept=0, left_arena=0, out_of_view=0, not_at_rest=0, no_free_start=0)
+    with Arena(settings, np.random.default_rng([seed, index])) as arena:
+        left = 0  # pokes that the scene is still good for
+        while len(kept) < pokes:
+            if not left:
+                arena.new_scene()
+                left, after = settings.pokes_per_scene, (*arena.observe(), arena.poses())
+            before, drawn, outcome = after, arena.sample_poke(*after[:2]), "no_free_start"
+            if drawn:
+                at_rest = arena.poke(*drawn)
+                after = *arena.observe(), arena.poses()
+                outcome = _outcome(before, after, len(arena.bodies), at_rest, settings)
+            left = left - 1 if outcome == "kept" else 0
+            if outcome == "kept":
+                kept.append((before, after, *drawn))
+            counts[outcome] += 1
+            if counts.total() > 20 * (len(kept) + 10):
+                raise ValueError(f"settings: hardly a poke can be used ({dict(counts)})")
+    befores, afters, drawn, starts = zip(*kept)
+    rgb_before, depth_before, labels, poses_before = map(np.stack, zip(*befores))
+    rgb_after, depth_after, _, poses_after = map(np.stack, zip(*afters))
+    meta = plain({"seed": seed, "shard": index, "settings": asdict(settings), "counts": dict(counts)})
+    interactions = Interactions(rgb_before, rgb_after, depth_before, depth_after, np.stack(drawn), np.stack(starts),
+                                arena.empty_depth, arena.camera, meta)
+    return interactions, Truth(labels, poses_before, poses_after), arena.bullet_seconds
+
+
+def _outcome(before, after, count, at_rest, settings):
+    """What became of a poke among `count` objects; frames are (rgb, depth, labels, poses)."""
+    poses = after[3][:count]
+    if np.abs(poses[:, :2]).max() > settings.arena / 2 or poses[:, 2].min() < 0:
+        return "left_arena"
+    if not at_rest:
+        return "not_at_rest"
+    seen = [np.isin(np.arange(1, count + 1), labels).all() for labels in (before[2], after[2])]
+    return "kept" if all(seen) else "out_of_view"
+
+
+def _collect_file(settings, seed, job):
+    (index, path, pokes), start = job, time.perf_counter()
+    interactions, truth, inside = collect_shard(settings, seed, index, pokes)
+    save_truth(path, truth)  # first, so that a shard never lacks its truth
+    save_shard(path, interactions)
+    return interactions.meta["counts"], inside, time.perf_counter() - start
+
+
+def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None):
+    """Collect `pokes` interactions into `folder`; shards already there from the same call are kept.
+
+    map: as Python's; that of a pool of processes collects several shards at a time. progress(done, total) is called
+    after every shard. Returns a dict: counts of kept and dropped pokes, seconds, and share_in_bullet, the share of the
+    shards' time spent inside Bullet's stepping and rendering (None if no shard was missing).
+    Raises ValueError for bad counts or a folder with other data in it.
+    """
+    check_whole("pokes", pokes, 1)
+    check_whole("seed", seed, 0)
+    folder, began, counts = Path(folder), time.perf_counter(), Counter()
+    missing = {folder / f"shard_{first // SHARD_POKES:04d}.npz": min(SHARD_POKES, pokes - first)
+               for first in range(0, pokes, SHARD_POKES)}
+    jobs = {path: (index, path, size) for index, (path, size) in enumerate(missing.items())}
+    for path in find_shards(folder):
+        old = load_shard(path)
+        if (old.meta["seed"], old.settings, len(old)) != (seed, plain(asdict(settings)), missing.get(path)):
+            raise ValueError(f"{path}: holds data of another seed, other settings or another number of pokes")
+        if truth_path(path).exists():
+            counts.update(old.meta["counts"])
+            del jobs[path]
+    done, inside, total = pokes - sum(size for *_, size in jobs.values()), 0.0, 0.0
+    for job, result in zip(jobs.values(), map(partial(_collect_file, settings, seed), jobs.values())):
+        counts.update(result[0])
+        inside, total, done = inside + result[1], total + result[2], done + job[2]
+        if progress:
+            progress(done, pokes)
+    return {"counts": dict(counts), "seconds": time.perf_counter() - began,
+            "share_in_bullet": inside / total if total else None}

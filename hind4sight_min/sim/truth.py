@@ -1,0 +1,77 @@
+"""What the simulator knows of its pokes and the robot does not see: for evaluation, and for SE3-Nets, the supervised
+baseline. Nothing that trains or plans without labels imports this file.
+"""
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..files import load_npz, save_npz
+from ..interactions import FORMAT, load_shard, shards_in
+
+
+@dataclass
+class Truth:
+    """What the simulator knows of M pokes. For evaluation (and the supervised baseline) only.
+
+    labels: (M, H, W) uint8 before the poke, 0 = background, i + 1 = object i.
+    poses_before, poses_after: (M, 7, 7) float32, arena, per object (x, y, z, qx, qy, qz, qw); unused rows 0.
+    """
+    labels: np.ndarray
+    poses_before: np.ndarray
+    poses_after: np.ndarray
+
+    def __getitem__(self, rows):
+        return Truth(self.labels[rows], self.poses_before[rows], self.poses_after[rows])
+
+
+def rotation_from_quaternion(quaternions):
+    """Unit quaternions (..., 4), (x, y, z, w) as in Bullet -> rotation matrices (..., 3, 3)."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternions, float), -1, 0)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
+    return np.stack(rows, axis=-1).reshape(x.shape + (3, 3))
+
+
+def true_scene_flow(points, labels, pose_before, pose_after):
+    """Scene flow of one interaction from the objects' poses. Paper: Sec. IV-C.
+
+    flow = R_a R_b^T (p - t_b) + t_a - p  for a point p on an object, 0 on the background.
+    points (H, W, 3) m arena, labels (H, W), poses (7, 7) -> (H, W, 3) float32 m.
+    """
+    flow = np.zeros(points.shape, np.float32)
+    before, after = (rotation_from_quaternion(pose[:, 3:]) for pose in (pose_before, pose_after))
+    for index in np.unique(labels[labels > 0]) - 1:
+        here = labels == index + 1
+        local = (points[here] - pose_before[index, :3]) @ before[index]
+        flow[here] = local @ after[index].T + pose_after[index, :3] - points[here]
+    return flow
+
+
+# --- files ---------------------------------------------------------------------------------------------------
+
+def truth_path(shard):
+    """The truth file that belongs to a shard."""
+    return Path(shard).with_suffix("").with_suffix(".truth.npz")
+
+
+def save_truth(shard, truth):
+    """Write the truth file of a shard, whole or not at all."""
+    save_npz(truth_path(shard), dict(vars(truth)), {"format": FORMAT})
+
+
+def load_truth(folder):
+    """The truth of all shards of a folder, joined -> Truth, in the order of `load_interactions`."""
+    parts = []
+    for shard in shards_in(folder):
+        path, pictures = truth_path(shard), load_shard(shard).depth_before.shape
+        part, _ = load_npz(path, FORMAT)
+        poses = (pictures[0], 7, 7)
+        for name, shape in (("labels", pictures), ("poses_before", poses), ("poses_after", poses)):
+            found = part[name].shape if name in part else "nothing"
+            if found != shape:
+                raise ValueError(f"{path}: {name}: expected shape {shape}, got {found}")
+        parts.append(part)
+    return Truth(*(np.concatenate([part[name] for part in parts])
+                   for name in ("labels", "poses_before", "poses_after")))

@@ -1,0 +1,39 @@
+"""Every benchmark runs, for one round and with the smallest settings, and records finite figures."""
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+RUNS = {  # benchmark -> what it needs, its arguments, figures that must be among those it records
+    "startup": ((), (), ("import_seconds", "import_command_line_seconds", "first_picture_seconds_max")),
+    "collection": (("pybullet",), ("--pokes", "2"), ("collect_jobs2_speedup_min", "collect_share_in_bullet")),
+    "planning": (("pybullet",), ("--before", ROOT), ("plan_candidates_per_second", "plan_speedup_vs_before")),
+    "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1", "--only",
+                                                    "ours", "torch_1_threads", "point_cloud_utils", "scipy"),
+                   ("chamfer_100_speedup_vs_point", "chamfer_100_speedup_vs_torch_max",
+                    "warp_24x32_speedup_vs_scipy", "warp_speedup_vs_grid_sample_min")),
+    "training_step": (("torch",), ("--batch", "9", "--before", ROOT, "--seconds", "0.1", "--only", "ours_1_process",
+                                   "ours_2_processes", "torch_tree_eager_1_threads"),
+                      ("train_step_speedup_vs_torch", "train_step_memory_vs_torch", "train_step_speedup_vs_before_max",
+                       "before_ours_2_processes_batch_9_ms", "network_over_matmul_floor", "chamfer_over_kdtree_floor")),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_benchmark_runs(name, tmp_path):
+    needs, arguments, expected = RUNS[name]
+    for library in needs:
+        pytest.importorskip(library, reason="only installed with the extra 'bench' or 'sim'")
+    path = tmp_path / "figures.json"
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--rounds", "1", "--json", path, *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert result.returncode == 0, result.stderr
+    assert "does not run here" not in result.stdout, result.stdout + result.stderr
+    figures = json.loads(path.read_text())
+    assert not set(expected) - set(figures), "the README's table and docs/results.py ask for these"
+    assert all(math.isfinite(value) and value > 0 for value in figures.values()), figures

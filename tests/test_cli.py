@@ -1,0 +1,314 @@
+"""The command as a user meets it: what it prints, what it writes, how it fails."""
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hind4sight_min import training
+from hind4sight_min.interactions import load_interactions, save_shard
+from hind4sight_min.lab import cli
+from hind4sight_min.lab.cli import data_small, main
+from hind4sight_min.networks import encode, predict, state_embedding
+from hind4sight_min.sim.truth import load_truth, save_truth
+
+ROOT = Path(__file__).resolve().parent.parent
+TINY = ["--steps", "3", "--batch", "2", "--width", "8", "--jobs", "1"]
+needs_bullet = pytest.mark.skipif(importlib.util.find_spec("pybullet") is None, reason="needs pybullet")
+
+
+def run(*arguments):
+    return main([str(each) for each in arguments])
+
+
+def one_line(capsys, status, *words):
+    """The command failed as promised: status 2, one line on stderr with these words, nothing else."""
+    out, err = capsys.readouterr()
+    assert status == 2
+    assert err.count("\n") == 1 and "Traceback" not in err
+    for word in words:
+        assert word in err, err
+
+
+def vector(path):
+    return training.load_run(path).vector
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A folder as `data_small`, with eight pokes to train on, six to test with, and a checkpoint after three steps."""
+    folder = tmp_path_factory.mktemp("small")
+    for name, count in (("train", 8), ("test", 6)):
+        save_truth(folder / name / "shard_0000.npz", load_truth(data_small() / name)[:count])
+        save_shard(folder / name / "shard_0000.npz", load_interactions(data_small() / name)[np.arange(count)])
+    model = folder / "checkpoint.npz"
+    assert run("train", folder / "train", model, *TINY, "--json", model.with_suffix(".json")) == 0
+    return folder
+
+
+@pytest.fixture
+def train(small):
+    return small / "train"
+
+
+@pytest.fixture
+def model(small):
+    return small / "checkpoint.npz"
+
+
+# --- train -------------------------------------------------------------------------------------------------------------
+
+def test_train_writes_a_checkpoint_its_log_and_a_picture(model):
+    assert {path.suffix for path in model.parent.glob("checkpoint.*")} == {".csv", ".json", ".npz", ".png"}
+    assert model.with_suffix(".csv").read_text().startswith("epoch,step,learning_rate,chamfer")
+    assert json.loads(model.with_suffix(".json").read_text())["loss_step"] == training.load_run(model).step == 3
+
+
+def test_the_same_seed_writes_the_same_checkpoint_and_never_needs_the_truth(train, model, tmp_path):
+    (tmp_path / "pokes").mkdir()
+    (tmp_path / "pokes" / "shard_0000.npz").symlink_to(train / "shard_0000.npz")
+    for seed in (0, 1):
+        assert run("train", tmp_path / "pokes", tmp_path / f"{seed}.npz", *TINY, "--seed", seed) == 0
+        assert np.array_equal(vector(tmp_path / f"{seed}.npz"), vector(model)) == (seed == 0)
+
+
+def test_options_of_train_are_those_of_the_recipe(train, tmp_path):
+    assert run("train", train, tmp_path / "a.npz", *TINY, "--masks", 4, "--seed", 5, "--optimiser", "adam", "--weight",
+               "chamfer=0", "--weight", "photometric=0.7", "--learning-rate", 0.01) == 0
+    recipe = training.load_run(tmp_path / "a.npz").recipe
+    assert (recipe.steps, recipe.batch, recipe.seed, recipe.optimiser) == (3, 2, 5, "adam")
+    assert (recipe.sizes.width, recipe.sizes.masks, recipe.learning_rate) == (8, 4, 0.01)
+    assert recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
+
+
+def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(train, model, tmp_path, capsys, monkeypatch):
+    noisy, whole, stopped = [*TINY, "--depth-noise", 0.01], tmp_path / "whole.npz", tmp_path / "stopped.npz"
+    assert run("train", train, whole, *noisy) == 0
+    assert not np.allclose(vector(whole), vector(model), atol=1e-6), "depth noise changes nothing"
+    save = cli.train_saving
+
+    def stop(interactions, run, path, objective, jobs, on_step, on_epoch):
+        def after(run, terms):
+            if run.step == 2:
+                raise KeyboardInterrupt
+        training.train(interactions, run, objective, on_step=lambda *done: (training.save_run(path, run), after(*done)))
+    monkeypatch.setattr(cli, "train_saving", stop)
+    assert run("train", train, stopped, *noisy) == 130
+    assert capsys.readouterr().err.strip().endswith("what is on disk is whole")
+    monkeypatch.setattr(cli, "train_saving", save)
+    one_line(capsys, run("train", train, stopped, "--resume", "--weight", "inverse=0"), "--resume", "weight")
+    assert training.load_run(stopped).step == 2
+    assert run("train", train, stopped, "--resume") == 0
+    np.testing.assert_array_equal(vector(stopped), vector(whole), "resumed without its noise?")
+
+
+def test_an_existing_checkpoint_is_not_overwritten(train, tmp_path, capsys):
+    (tmp_path / "model.npz").write_bytes(b"precious")
+    one_line(capsys, run("train", train, tmp_path / "model.npz", *TINY), "exists already")
+    assert (tmp_path / "model.npz").read_bytes() == b"precious"
+
+
+# --- evaluate and show -------------------------------------------------------------------------------------------------
+
+def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp_path, capsys):
+    assert run("evaluate", "--json", tmp_path / "metrics.json") == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    recorded = json.loads((ROOT / "docs" / "results" / "shipped.json").read_text())["figures"]
+    assert metrics == pytest.approx(recorded, rel=0.01, abs=1e-6)  # other NumPys and OpenCVs round differently
+    assert capsys.readouterr().err == "", "a progress line away from a terminal"
+
+
+def test_the_report_shows_every_kind_of_poke_that_there_is(capsys):
+    metrics = json.loads((ROOT / "docs" / "results" / "shipped.json").read_text())["figures"]
+    for i, group in enumerate(("", "single_", "multi_", "wall_", "trimmed_")):
+        metrics.update({f"{group}flow_mse_ratio": 0.1 + 0.1 * i, f"{group}flow_mse_ratio_se": 0.011 * (i + 1),
+                        f"{group}pokes" if group else "pokes_moved": 90 - i})
+    cli.print_metrics({**metrics, "multi_pokes": 0, "multi_flow_mse_ratio": np.nan})
+    out = capsys.readouterr().out
+    for line in ("0.100 \u00b1 0.011   90 pokes", "0.200 \u00b1 0.022   89 pokes", "0.400 \u00b1 0.044   87 pokes",
+                 "0.500 \u00b1 0.055   86 pokes", "no motion", "chance 18"):
+        assert line in out, out
+    assert "two or more" not in out and "nan" not in out
+
+
+def test_every_layer_of_the_shipped_checkpoint_is_alive():
+    shipped, data = training.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
+    _, gradient = training.chunk_gradient(training.unsupervised, shipped.vector, shipped.layout, shipped.recipe, data, 0)
+    for name, part in training.unflatten(gradient, shipped.layout).items():
+        if name != "heatmaps_b":  # the same for all cells: softmax does not see it
+            assert np.abs(part).max() > 1e-6, name
+    before, after = training.scenes_of(data)
+    features = encode(shipped.params, before.points[before.valid])
+    assert (features.max(axis=0) > 1e-3).mean() > 0.9, "units die in long runs, if they may"
+    predicted = predict(shipped.params, shipped.recipe.sizes, before, data.pokes).points
+    now, said, then = (state_embedding(shipped.params, points, occupied) for points, occupied in (
+        (before.points, before.occupied), (predicted, before.occupied), (after.points, after.occupied)))
+    assert np.abs(said - then).sum() < 0.6 * np.abs(now - then).sum(), "no nearer to the next state than this one is"
+
+
+def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(model, tmp_path, capsys):
+    for options, said in ((["--row", 5], "interaction 5\n"), ([], "interaction 135\n")):
+        assert run("show", model, *options, "--out", tmp_path / "poke.png") == 0
+        assert capsys.readouterr().out.endswith(said)
+        assert (tmp_path / "poke.png").read_bytes().startswith(b"\x89PNG")
+    for row in (-1, 10 ** 6):
+        one_line(capsys, run("show", model, "--row", row), "row", str(row))
+
+
+def test_a_checkpoint_of_another_camera_is_refused(model, tmp_path, capsys):
+    other = training.load_run(model)
+    other.meta["camera"]["fx"] += 1
+    training.save_run(tmp_path / "other.npz", other)
+    for command in ("evaluate", "show"):
+        one_line(capsys, run(command, tmp_path / "other.npz"), "another camera")
+
+
+# --- collect, plan and the demo ------------------------------------------------------------------------------------------
+
+@needs_bullet
+def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsys):
+    assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures", "rings",
+               "--size", 96, 72, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
+    assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
+    data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
+    assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
+    assert found["pokes_kept"] == 3 and 0 < found["collect_share_in_bullet"] <= 1
+    assert "3 pokes" in capsys.readouterr().out
+
+
+@needs_bullet
+def test_plan_writes_a_record_an_animation_and_the_population(model, tmp_path, capsys):
+    assert run("plan", model, "--policy", "oracle", "--candidates", 8, "--iterations", 1, "--budget", 1, "--seed", 1,
+               "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
+    out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
+    assert "poke 1 to (" in out and "cm from the goals" in out
+    assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
+    for name, begin in (("plan.gif", b"GIF89a"), ("cem.png", b"\x89PNG"), ("plan.npz", b"PK")):
+        assert (tmp_path / name).read_bytes().startswith(begin), name
+
+
+@needs_bullet
+@pytest.mark.parametrize("arguments, words", [
+    (["--mark", 0, 47, "--goal", 32, 24], ["(0, 47) lies on the background"]),
+    (["--mark", 99, 3, "--goal", 32, 24], ["(99, 3) lies outside the 64 x 48 picture"]),
+    (["--mark", 3, 3], ["--mark, --goal: expected both or neither"]), (["--click"], ["no display"]),
+    (["--pixel-weight", -1], ["pixel_weight"]), (["--budget", 0], ["budget", "0"]), (["--seed", -1], ["seed", "-1"]),
+    (["--objects", 2, "--obstacle"], ["movers", "obstacle"])])
+def test_plan_refuses_in_one_line(model, arguments, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    one_line(capsys, run("plan", model, *arguments, "--out", tmp_path / "new"), *words)
+    assert not (tmp_path / "new").exists()
+
+
+def test_clicks_are_pairs(monkeypatch):
+    import matplotlib.pyplot as plt
+    monkeypatch.setattr(plt, "get_backend", lambda: "a window")
+    monkeypatch.setattr(plt, "ginput", lambda **_: [(1, 2), (3, 4), (5, 6), (7, 8)])
+    marks, goals = cli.click(np.zeros((4, 4, 3)))
+    assert marks.tolist() == [[1, 2], [5, 6]] and goals.tolist() == [[3, 4], [7, 8]]
+    monkeypatch.setattr(plt, "ginput", lambda **_: [(1, 2)])
+    with pytest.raises(ValueError, match="pairs of clicks"):
+        cli.click(np.zeros((4, 4, 3)))
+
+
+@pytest.fixture
+def short_demo(small, tmp_path, monkeypatch, capsys):
+    """Run the demo on next to nothing, into tmp_path -> its figures, what it printed."""
+    for name, value in (("DEMO_POKES", 8), ("DEMO_TEST_POKES", 6), ("DEMO_STEPS", 2), ("data_small", lambda: small)):
+        monkeypatch.setattr(cli, name, value)
+
+    def demo():
+        assert run("demo", "--out", tmp_path, "--jobs", 1) == 0
+        figures = json.loads((tmp_path / "metrics.json").read_text())
+        assert figures["demo_pokes"] == 6 and figures.pop("demo_seconds") > 0
+        assert figures["demo_flow_mse_ratio"] == pytest.approx(1, abs=0.2)  # two steps teach nothing
+        for name in ("checkpoint.npz", "checkpoint.csv", "checkpoint.png", "interaction.png"):
+            assert (tmp_path / name).stat().st_size > 50, name
+        return figures, capsys.readouterr().out
+    return demo
+
+
+@needs_bullet
+def test_the_demo_simulates_trains_evaluates_shows_and_plans(short_demo, tmp_path):
+    figures, out = short_demo()
+    assert 0 <= figures["demo_plan_distance_left"] <= 1.5 and (tmp_path / "plan.gif").exists()
+    assert cli.NO_BULLET not in out and out.count("$ hind4sight collect") == 2
+    train, test = (load_interactions(tmp_path / name) for name in ("train", "test"))
+    assert (len(train), len(test)) == (8, 6)
+    assert not np.isin(test.pokes, train.pokes).all(axis=1).any(), "evaluated on pokes that it was trained on"
+
+
+def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(short_demo, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    figures, out = short_demo()
+    assert "demo_plan_distance_left" not in figures and not (tmp_path / "plan.gif").exists()
+    assert out.count(cli.NO_BULLET) == 1 and "\n" not in cli.NO_BULLET and "pip install pybullet" in cli.NO_BULLET
+    assert short_demo()[0] == pytest.approx(figures, nan_ok=True), "a second time, the same"
+    one_line(capsys, run("collect", tmp_path / "new", "--pokes", 1, "--jobs", 1), "pybullet", "pip install")
+    assert not list(tmp_path.glob("new/*"))
+
+
+# --- what is wrong ends in one line -----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("arguments, words", [
+    ("evaluate no.npz", ["no.npz", "no such file"]), ("evaluate pokes/shard_0000.npz", ["shard_0000.npz", "format"]),
+    ("train nowhere out.npz", ["nowhere", "no such folder"]), ("train broken out.npz", ["shard_0000.npz", "damaged"]),
+    ("train pokes out.npz --steps -1", ["steps", "-1"]), ("train pokes out.npz --batch 0", ["batch"]),
+    ("train pokes out.npz --masks 1", ["masks"]), ("train pokes out.npz --jobs 0", ["jobs"]),
+    ("train pokes out.npz --optimiser sgd", ["optimiser", "sgd"]),
+    ("train pokes out.npz --depth-noise -1", ["standard_deviation", "-1"]),
+    ("train pokes out.npz --weight chamfer=-1", ["weights"]),
+    ("train pokes out.npz --resume", ["out.npz", "no such file"]), ("train pokes", ["out", ".npz"]),
+    ("train pokes model.png", ["out", ".npz", "model.png"]), ("reproduce planning --out p --jobs 0", ["jobs", "0"]),
+    ("collect c --pokes -5", ["pokes", "-5"]), ("collect c --objects 0 3", ["objects"]),
+    ("collect c --kinds teapot", ["kinds", "teapot"]), ("collect c --textures tartan", ["textures", "tartan"]),
+    ("collect c --seed -1", ["seed"]), ("collect c --jobs 0", ["jobs"]), ("collect c --size 96 48", ["width", "96"])])
+def test_wrong_input_ends_in_one_line(arguments, words, train, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("pokes").symlink_to(train)
+    Path("broken").mkdir()
+    Path("broken/shard_0000.npz").write_bytes((train / "shard_0000.npz").read_bytes()[:5000])
+    one_line(capsys, run(*arguments.split()), *words)
+    assert {path.name for path in tmp_path.iterdir()} == {"broken", "pokes"}, "something was written"
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["collect"], ["evaluate", "--json"], *(
+    ["train", "data", "out.npz", "--weight", wrong] for wrong in ("chamfers=1", "chamfer", "chamfer=much"))])
+def test_usage_errors_are_one_line_too(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    one_line(capsys, stop.value.code, "--weight" if "train" in arguments else "")
+
+
+# --- the program -------------------------------------------------------------------------------------------------------
+
+def test_module_and_installed_command_are_the_same_from_any_folder(tmp_path):
+    for how in ([sys.executable, "-m", "hind4sight_min"], [str(Path(sys.executable).parent / "hind4sight")]):
+        if not Path(how[0]).exists():
+            pytest.skip("the package is not installed here")
+        done = subprocess.run([*how, "--help"], capture_output=True, text=True, cwd=tmp_path, timeout=60,
+                              env={**os.environ, "PYTHONPATH": str(ROOT)})
+        assert done.returncode == 0 and done.stderr == ""
+        for name in ("collect", "train", "evaluate", "show", "plan", "reproduce", "demo"):
+            assert name in done.stdout
+
+
+def test_what_takes_long_to_import_waits_until_it_is_needed():
+    code = ("import sys, hind4sight_min.lab.cli; "
+            "sys.exit(', '.join({'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules)) or 0)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_progress_is_for_terminals_only(monkeypatch, capsys):
+    assert cli.progress_line("train") is None
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    show = cli.progress_line("train")
+    show(1, 4)
+    show(4, 4)
+    err = capsys.readouterr().err
+    assert "train: 1 of 4" in err and "s left" in err and err.endswith("\n")

@@ -1,0 +1,87 @@
+"""Training that is stopped and goes on: its log, its checkpoints, its seconds."""
+import csv
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny import TINY, tiny_pokes
+
+from hind4sight_min import training
+from hind4sight_min.lab import runs
+from hind4sight_min.lab.runs import train_saving
+from hind4sight_min.training import load_run, start_run
+
+
+class Stop(Exception):
+    pass
+
+
+def stop_after(steps):
+    def on_step(run, terms):
+        if run.step == steps:
+            raise Stop
+    return on_step
+
+
+def test_the_log_is_the_mean_over_the_steps_of_an_epoch(tmp_path):
+    data, seen, told = tiny_pokes(count=20), [], []  # four steps an epoch, six in all
+    run = start_run(TINY, data)
+    log = train_saving(data, run, tmp_path / "run.npz", on_step=lambda run, terms: seen.append(terms),
+                       on_epoch=told.append)
+    assert log == run.meta["log"] == told and run.meta["sums"] == {}
+    assert [(entry["epoch"], entry["step"]) for entry in log] == [(1, 4), (2, 6)]
+    assert [entry["learning_rate"] for entry in log] == [training.learning_rate(TINY, step) for step in (3, 5)]
+    for entry, steps in zip(log, (seen[:4], seen[4:])):
+        assert set(entry) == {"epoch", "step", "learning_rate", *TINY.weights}
+        for name in TINY.weights:
+            assert entry[name] == pytest.approx(np.mean([terms[name] for terms in steps])), name
+    with open(tmp_path / "run.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["chamfer"]) for row in rows] == pytest.approx([entry["chamfer"] for entry in log], rel=1e-5)
+
+
+@pytest.mark.parametrize("stop", [2, 4, 5])  # within the first epoch, at its end, within the second
+def test_a_resumed_run_is_the_same_run_with_the_same_log(stop, tmp_path):
+    data = tiny_pokes(count=20)
+    whole = start_run(TINY, data)
+    train_saving(data, whole, tmp_path / "whole.npz")
+    with pytest.raises(Stop):
+        train_saving(data, start_run(TINY, data), tmp_path / "run.npz", save_every=0.0, on_step=stop_after(stop + 1))
+    resumed = load_run(tmp_path / "run.npz")
+    assert resumed.step == stop and bool(resumed.meta["sums"]) == (stop != 4)
+    train_saving(data, resumed, tmp_path / "run.npz")
+    np.testing.assert_array_equal(resumed.vector, whole.vector)
+    assert resumed.meta["log"] == whole.meta["log"]
+    again = load_run(tmp_path / "run.npz")
+    assert again.meta == resumed.meta and again.step == 6
+
+
+def test_seconds_add_up_over_calls_and_a_checkpoint_is_written_in_time(tmp_path, monkeypatch):
+    data, run, saved, clock = tiny_pokes(), start_run(replace(TINY, steps=8), tiny_pokes()), [], [0.0]
+    monkeypatch.setattr(runs.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(runs, "save_run", lambda path, run: saved.append((run.step, run.meta["seconds"])))
+
+    def tick(run, terms):
+        clock[0] += 25.0
+    train_saving(data, run, tmp_path / "run.npz", on_step=tick)
+    assert saved == [(3, 75.0), (6, 150.0), (8, 200.0)], "every minute, and at the end"
+    run.recipe = replace(run.recipe, steps=10)
+    train_saving(data, run, tmp_path / "run.npz", on_step=tick)
+    assert run.meta["seconds"] == 250.0
+
+
+def test_jobs_become_processes_and_no_more_than_there_are_chunks(tmp_path, monkeypatch):
+    asked = []
+
+    @contextmanager
+    def parallel_map(jobs):
+        asked.append(jobs)
+        yield map
+    monkeypatch.setattr(runs, "parallel_map", parallel_map)
+    for jobs in (1, 2, 9):
+        train_saving(tiny_pokes(), start_run(replace(TINY, batch=12, steps=1), tiny_pokes()), tmp_path / "run.npz",
+                     jobs=jobs)
+    assert asked == [1, 2, 2]
+    with pytest.raises(ValueError, match="jobs"):
+        train_saving(tiny_pokes(), start_run(TINY, tiny_pokes()), tmp_path / "run.npz", jobs=0)
