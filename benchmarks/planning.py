@@ -1,4 +1,4 @@
-"""How long one planning step takes, and where: candidates per second, and the share of time in the model.
+"""How long one planning step takes, and how many candidates per second that makes.
 
     python benchmarks/planning.py [--rounds 9] [--json out.json]
     python benchmarks/planning.py --before DIR     in turns with the same of DIR, a clone of another commit
@@ -27,29 +27,17 @@ from hind4sight_min.lab.control import first_look, random_task
 
 def measure(rounds):
     """Plan so many steps -> the figures."""
-    run, search, inside, predict = training.load_run(DATA / "checkpoint.npz"), planning.Search(), [], planning.predict
-
-    def timed(*arguments):
-        began = time.perf_counter()
-        result = predict(*arguments)
-        inside.append(time.perf_counter() - began)
-        return result
-
-    planning.predict = timed
+    run, search, seconds = training.load_run(DATA / "checkpoint.npz"), planning.Search(), []
     with random_task(0, 2) as task:
         camera, settings = task.arena.camera, task.settings
         _, view, goal = first_look(task)
     rollout = partial(planning.roll, planning.learned_step(run, view), view, settings=settings)
-    seconds, shares = [], []
     for seed in range(rounds):
-        inside.clear()
         began = time.perf_counter()
         planning.plan(rollout, view, goal, camera, settings, search, np.random.default_rng(seed))
         seconds.append(time.perf_counter() - began)
-        shares.append(sum(inside) / seconds[-1])
     median = statistics.median(seconds)
-    return {"plan_step_seconds": median, "plan_share_in_model": statistics.median(shares),
-            "plan_candidates_per_second": search.candidates * search.iterations / median}
+    return {"plan_step_seconds": median, "plan_candidates_per_second": search.candidates * search.iterations / median}
 
 
 def speedups_over(before, rounds):

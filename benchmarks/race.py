@@ -40,10 +40,10 @@ def serve(contender):
     """
     with contender as call:
         for line in sys.stdin:
-            start = time.perf_counter()
+            began = time.perf_counter()
             for _ in range(int(line)):
                 call()
-            print(time.perf_counter() - start, flush=True)
+            print(time.perf_counter() - began, flush=True)
         workers = sum(_own_peak(process.pid) for process in active_children())
     print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss + workers) / 1024, flush=True)
 
@@ -117,9 +117,9 @@ def spread(name, values):
     return {name: statistics.median(values), f"{name}_min": min(values), f"{name}_max": max(values)}
 
 
-def shown(values, digits=2):
+def shown(values):
     """The same, to be read."""
-    return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+    return f"{statistics.median(values):.2f} ({min(values):.2f} to {max(values):.2f})"
 
 
 def report(times, memory):

@@ -21,8 +21,7 @@ def tensors(batch):
     """A training.Batch as a dict of tensors, with the points that the model looks at."""
     before, after = batch.before, batch.after
     rows, seen = look(before, batch.pokes)
-    arrays = {name: value for prefix, scene in (("", before), ("next_", after))
-              for name, value in ((prefix + name, value) for name, value in vars(scene).items())}
+    arrays = {**vars(before), **{f"next_{name}": value for name, value in vars(after).items()}}
     arrays["shared"], arrays["next_shared"] = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     arrays.update(rows=rows, seen=seen, next_rows=look(after, batch.pokes)[0], pokes=batch.pokes)
     arrays.update(zip(("changed", "next_changed", "change", "centres"), batch.evidence))
@@ -43,10 +42,6 @@ def fourier(values, wavelengths):
 
 def position_features(points, unit, wavelengths):
     return torch.cat([points / unit, torch.tanh(points[..., 2:] / 0.01), fourier(points[..., :2], wavelengths)], dim=-1)
-
-
-def encoder_features(points):
-    return position_features(points, 0.25, (0.8, 0.4, 0.2, 0.1))
 
 
 def poke_features(local):
@@ -93,7 +88,7 @@ def linear(p, name, x):
 
 
 def encode(p, points):
-    x = activation(linear(p, "encoder_1", encoder_features(points)))
+    x = activation(linear(p, "encoder_1", position_features(points, 0.25, (0.8, 0.4, 0.2, 0.1))))
     return activation(linear(p, "encoder_2", x))
 
 

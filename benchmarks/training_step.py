@@ -5,7 +5,8 @@
 
 Every contender makes the same steps on the same pokes: batch, forward, losses, backward, optimiser. BLAS has one thread
 in our processes; PyTorch is tried with one and two, with brute-force and KD-tree Chamfer, eager and compiled, and the
-fastest median counts. Memory is the peak, a worker's own pages added to its parent's (Linux only).
+fastest median counts. Memory is the peak, a worker's own pages added to its parent's (Linux only). PyTorch gets its
+batches from `make_batch` too, and the C library keeps freed memory for it as it does for us.
 
 Also the floor: how long the bare matrix products of the network and the bare KD-trees of the Chamfer distance take,
 which no implementation can do without where all points move. Some ten minutes on two cores.
@@ -27,8 +28,7 @@ from hind4sight_min import losses, networks, training
 from hind4sight_min.files import write_json
 from hind4sight_min.interactions import load_interactions
 from hind4sight_min.lab.processes import parallel_map
-from hind4sight_min.ops import at_rows, take, unflatten
-from hind4sight_min.scene import look
+from hind4sight_min.ops import unflatten
 
 OURS = ("ours_1_process", "ours_2_processes")
 TWINS = tuple(f"torch_{chamfer}_{mode}_{threads}_threads" for chamfer in ("tree", "brute")
@@ -47,7 +47,7 @@ def ours(batch, jobs):
 
 
 @contextmanager
-def twin(batch, chamfer, mode, threads):
+def twin(batch, threads, chamfer, mode):
     import torch
     import torch_twin
     torch.set_num_threads(threads)
@@ -75,13 +75,6 @@ def twin(batch, chamfer, mode, threads):
             optimiser.step()
         run.step += 1
     yield step
-
-
-def contender(name, batch):
-    if name in OURS:
-        return ours(batch, jobs=1 + OURS.index(name))
-    _, chamfer, mode, threads, _ = name.split("_")
-    return twin(batch, chamfer, mode, int(threads))
 
 
 # --- the floor ---------------------------------------------------------------------------------------------------
@@ -114,32 +107,27 @@ def floors(rounds, count=8):
     batch, sizes = training.make_batch(data, run.recipe, rng), run.recipe.sizes
     before, after = batch.before, batch.after
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
-    rows, next_rows = (at_rows(look(scene, batch.pokes)[0]) for scene in (before, after))
 
     def network(vector):
         params = unflatten(vector, run.layout)
         predicted = networks.predict(params, sizes, before, batch.pokes).points
-        outputs = (predicted, *networks.inverse_model(params, *batch.evidence),
-                   networks.state_embedding(params, take(predicted, rows), before.occupied[rows]),
-                   networks.state_embedding(params, after.points[next_rows], after.occupied[next_rows]))
-        return sum((value * value).sum() for value in outputs)
+        return sum((value * value).sum() for value in (predicted, *networks.inverse_model(params, *batch.evidence)))
 
     def chamfer(predicted):
         return losses.chamfer_loss(*losses.distance_maps(predicted, after.points, valid, next_valid)).sum()
 
-    pairs = products_of(network, vector)
-    moved = before.points + 1e-3 * rng.standard_normal(before.points.shape).astype(np.float32)
-
     def bare_products():
         for a, b in pairs:
             np.matmul(a, b)
+
+    moved = before.points + 1e-3 * rng.standard_normal(before.points.shape).astype(np.float32)
 
     def bare_trees():
         for p, q, here, there in zip(moved, after.points, valid, next_valid):
             cKDTree(q[there], compact_nodes=False, balanced_tree=False).query(p)
             cKDTree(p[here], compact_nodes=False, balanced_tree=False).query(q)
 
-    figures = {}
+    figures, pairs = {}, products_of(network, vector)
     for name, call, bare in (("network_over_matmul_floor", lambda: grad(network)(vector), bare_products),
                              ("chamfer_over_kdtree_floor", lambda: grad(chamfer)(moved), bare_trees)):
         each = [[min(repeat(function, number=1)) for function in (call, bare)] for _ in range(rounds)]
@@ -158,13 +146,14 @@ def main():
     parser.add_argument("--contender", choices=OURS + TWINS, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.contender:
-        return serve(contender(args.contender, args.batch[0]))
+        kind, *how, count, _ = args.contender.split("_")
+        return serve({"ours": ours, "torch": twin}[kind](args.batch[0], int(count), *how))
     before = tuple(f"before_{name}" for name in OURS if args.before and name in args.only)
     figures = floors(args.rounds)
     for batch in args.batch:
         print(f"a step of {batch} interactions")
-        times, memory = race(__file__, (*args.only, *before), ["--batch", batch], args.rounds, args.seconds, hopeless=3.0,
-                             before=args.before)
+        times, memory = race(__file__, (*args.only, *before), ["--batch", batch], args.rounds, args.seconds,
+                             hopeless=3.0, before=args.before)
         report(times, memory)
         figures.update({f"{name}_batch_{batch}_ms": 1e3 * statistics.median(values) for name, values in times.items()})
         figures.update({f"{name}_batch_{batch}_mb": value for name, value in memory.items()})

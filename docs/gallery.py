@@ -33,7 +33,7 @@ SHOWN, WIDTH, LARGEST_GIF = 2, 800, 400_000  # pictures per tutorial, px, bytes
 PARTS = {
     "title": r"\A(\S.*)\n\n",
     "question": r"^Question: ((?:.+\n)+)",
-    "equations": r"^Equations:\n((?:- .+\n)+)",
+    "equations": r"^Equations:\n((?:- .+\n(?:  .+\n)*)+)",
     "time": r"^Time: (\d+ s)\.",
     "pictures": r"^Time: .*?Pictures: ((?:.+\n)+)",
     "lines": r"^Last lines to expect:\n(.+\n.+)\Z",
@@ -121,7 +121,7 @@ def parse(path):
             raise ValueError(f"{path.name}: its docstring lacks its {name}, or in the wrong form; see 03_chamfer.py")
         parts[name] = match.group(1)
     equations = []
-    for line in parts["equations"].splitlines():
+    for line in parts["equations"].replace("\n  ", " ").splitlines():  # a line may go on, indented
         match = EQUATION.fullmatch(line)
         if not match:
             raise ValueError(f"{path.name}: expected '- what: `module.function`, ...; tests/file.py', got {line!r}")

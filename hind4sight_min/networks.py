@@ -4,15 +4,9 @@ Every network is the same small perceptron applied to each point, plus *context*
 a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
 once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
 
-The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. Box of Fig. 3 -> function here
-(its layers):
-    encoder, siamese             `encode` (encoder_*), one point at a time; `state_embedding`, its sum
-    poke                         `geometry.poke_frame`: not an input of its own but the frame that points are given in
-    decoder of masks             `forward_model` (trunk_*, context_*, shape_*, mask)
-    decoder of SE(3) motions     `_motions` (motion_*), from the features under each mask; the background's is fixed
-    next state embedding         `state_embedding` of the predicted cloud, by the same encoder
-    inverse model, heat-maps     `inverse_model` (change_*, cell_*, heatmaps), from what `scene.most_changed` finds
-Ours alone: `height_map`, `pooling_weights`, `first_met`, the bounds of masks and all constants.
+The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. docs/architecture.md has each
+box of Fig. 3 with its function here, docs/not-in-the-paper.md what is ours alone (`height_map`, `pooling_weights`,
+`first_met`, the bounds of masks and all constants).
 """
 from dataclasses import dataclass
 

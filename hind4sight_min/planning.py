@@ -197,7 +197,7 @@ def planning_cost(clouds, view, goal, camera, search):
     return cost
 
 
-# --- the cross entropy method ----------------------------------------------------------------------------------------
+# --- the cross entropy method -------------------------------------------------------------------------------------
 
 LEAST = np.array([0.002, 0.002, 0.03])  # m, m, rad: a narrower Gaussian only draws the same pokes again
 

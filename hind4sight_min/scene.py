@@ -99,7 +99,7 @@ def crop(scene, pokes, camera):
     return Scene(**cut, images=scene.images[pick])
 
 
-# --- what changed: the evidence of a poke, for the inverse model -------------------------------------------------------
+# --- what changed: the evidence of a poke, for the inverse model --------------------------------------------------
 
 CHANGED = 1 / 24  # of the picture's points: a poke changes about a hundred of 64 x 48
 

@@ -50,45 +50,35 @@ def small(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def train(small):
-    return small / "train"
+# --- train ----------------------------------------------------------------------------------------
+
+def test_train_writes_a_checkpoint_its_log_and_a_picture(small):
+    assert {path.suffix for path in small.glob("checkpoint.*")} == {".csv", ".json", ".npz", ".png"}
+    assert (small / "checkpoint.csv").read_text().startswith("epoch,step,learning_rate,chamfer")
+    assert json.loads((small / "checkpoint.json").read_text())["loss_step"] == 3
 
 
-@pytest.fixture
-def model(small):
-    return small / "checkpoint.npz"
-
-
-# --- train -------------------------------------------------------------------------------------------------------------
-
-def test_train_writes_a_checkpoint_its_log_and_a_picture(model):
-    assert {path.suffix for path in model.parent.glob("checkpoint.*")} == {".csv", ".json", ".npz", ".png"}
-    assert model.with_suffix(".csv").read_text().startswith("epoch,step,learning_rate,chamfer")
-    assert json.loads(model.with_suffix(".json").read_text())["loss_step"] == training.load_run(model).step == 3
-
-
-def test_the_same_seed_writes_the_same_checkpoint_and_never_needs_the_truth(train, model, tmp_path):
+def test_the_same_seed_writes_the_same_checkpoint_and_never_needs_the_truth(small, tmp_path):
     (tmp_path / "pokes").mkdir()
-    (tmp_path / "pokes" / "shard_0000.npz").symlink_to(train / "shard_0000.npz")
+    (tmp_path / "pokes" / "shard_0000.npz").symlink_to(small / "train" / "shard_0000.npz")
     for seed in (0, 1):
         assert run("train", tmp_path / "pokes", tmp_path / f"{seed}.npz", *TINY, "--seed", seed) == 0
-        assert np.array_equal(vector(tmp_path / f"{seed}.npz"), vector(model)) == (seed == 0)
+        assert np.array_equal(vector(tmp_path / f"{seed}.npz"), vector(small / "checkpoint.npz")) == (seed == 0)
 
 
-def test_options_of_train_are_those_of_the_recipe(train, tmp_path):
-    assert run("train", train, tmp_path / "a.npz", *TINY, "--masks", 4, "--seed", 5, "--optimiser", "adam", "--weight",
-               "chamfer=0", "--weight", "photometric=0.7", "--learning-rate", 0.01) == 0
+def test_options_of_train_are_those_of_the_recipe(small, tmp_path):
+    assert run("train", small / "train", tmp_path / "a.npz", *TINY, "--masks", 4, "--seed", 5, "--optimiser", "adam",
+               "--weight", "chamfer=0", "--weight", "photometric=0.7", "--learning-rate", 0.01) == 0
     recipe = training.load_run(tmp_path / "a.npz").recipe
     assert (recipe.steps, recipe.batch, recipe.seed, recipe.optimiser) == (3, 2, 5, "adam")
     assert (recipe.sizes.width, recipe.sizes.masks, recipe.learning_rate) == (8, 4, 0.01)
     assert recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
 
 
-def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(train, model, tmp_path, capsys, monkeypatch):
+def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(small, tmp_path, capsys, monkeypatch):
     noisy, whole, stopped = [*TINY, "--depth-noise", 0.01], tmp_path / "whole.npz", tmp_path / "stopped.npz"
-    assert run("train", train, whole, *noisy) == 0
-    assert not np.allclose(vector(whole), vector(model), atol=1e-6), "depth noise changes nothing"
+    assert run("train", small / "train", whole, *noisy) == 0
+    assert not np.allclose(vector(whole), vector(small / "checkpoint.npz"), atol=1e-6), "depth noise changes nothing"
     save = cli.train_saving
 
     def stop(interactions, run, path, objective, jobs, on_step, on_epoch):
@@ -97,22 +87,22 @@ def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(train, model,
                 raise KeyboardInterrupt
         training.train(interactions, run, objective, on_step=lambda *done: (training.save_run(path, run), after(*done)))
     monkeypatch.setattr(cli, "train_saving", stop)
-    assert run("train", train, stopped, *noisy) == 130
+    assert run("train", small / "train", stopped, *noisy) == 130
     assert capsys.readouterr().err.strip().endswith("what is on disk is whole")
     monkeypatch.setattr(cli, "train_saving", save)
-    one_line(capsys, run("train", train, stopped, "--resume", "--weight", "inverse=0"), "--resume", "weight")
+    one_line(capsys, run("train", small / "train", stopped, "--resume", "--weight", "inverse=0"), "--resume", "weight")
     assert training.load_run(stopped).step == 2
-    assert run("train", train, stopped, "--resume") == 0
+    assert run("train", small / "train", stopped, "--resume") == 0
     np.testing.assert_array_equal(vector(stopped), vector(whole), "resumed without its noise?")
 
 
-def test_an_existing_checkpoint_is_not_overwritten(train, tmp_path, capsys):
+def test_an_existing_checkpoint_is_not_overwritten(small, tmp_path, capsys):
     (tmp_path / "model.npz").write_bytes(b"precious")
-    one_line(capsys, run("train", train, tmp_path / "model.npz", *TINY), "exists already")
+    one_line(capsys, run("train", small / "train", tmp_path / "model.npz", *TINY), "exists already")
     assert (tmp_path / "model.npz").read_bytes() == b"precious"
 
 
-# --- evaluate and show -------------------------------------------------------------------------------------------------
+# --- evaluate and show ----------------------------------------------------------------------------
 
 def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp_path, capsys):
     assert run("evaluate", "--json", tmp_path / "metrics.json") == 0
@@ -136,43 +126,43 @@ def test_the_report_shows_every_kind_of_poke_that_there_is(capsys):
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
-    shipped, data = training.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
-    _, gradient = training.chunk_gradient(training.unsupervised, shipped.vector, shipped.layout, shipped.recipe, data, 0)
-    for name, part in training.unflatten(gradient, shipped.layout).items():
+    run, data = training.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
+    _, gradient = training.chunk_gradient(training.unsupervised, run.vector, run.layout, run.recipe, data, [0])
+    for name, part in training.unflatten(gradient, run.layout).items():
         if name != "heatmaps_b":  # the same for all cells: softmax does not see it
             assert np.abs(part).max() > 1e-6, name
     before, after = training.scenes_of(data)
-    features = encode(shipped.params, before.points[before.valid])
+    features = encode(run.params, before.points[before.valid])
     assert (features.max(axis=0) > 1e-3).mean() > 0.9, "units die in long runs, if they may"
-    predicted = predict(shipped.params, shipped.recipe.sizes, before, data.pokes).points
-    now, said, then = (state_embedding(shipped.params, points, occupied) for points, occupied in (
+    predicted = predict(run.params, run.recipe.sizes, before, data.pokes).points
+    now, said, then = (state_embedding(run.params, points, occupied) for points, occupied in (
         (before.points, before.occupied), (predicted, before.occupied), (after.points, after.occupied)))
     assert np.abs(said - then).sum() < 0.6 * np.abs(now - then).sum(), "no nearer to the next state than this one is"
 
 
-def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(model, tmp_path, capsys):
+def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_path, capsys):
     for options, said in ((["--row", 5], "interaction 5\n"), ([], "interaction 135\n")):
-        assert run("show", model, *options, "--out", tmp_path / "poke.png") == 0
+        assert run("show", small / "checkpoint.npz", *options, "--out", tmp_path / "poke.png") == 0
         assert capsys.readouterr().out.endswith(said)
         assert (tmp_path / "poke.png").read_bytes().startswith(b"\x89PNG")
     for row in (-1, 10 ** 6):
-        one_line(capsys, run("show", model, "--row", row), "row", str(row))
+        one_line(capsys, run("show", small / "checkpoint.npz", "--row", row), "row", str(row))
 
 
-def test_a_checkpoint_of_another_camera_is_refused(model, tmp_path, capsys):
-    other = training.load_run(model)
+def test_a_checkpoint_of_another_camera_is_refused(small, tmp_path, capsys):
+    other = training.load_run(small / "checkpoint.npz")
     other.meta["camera"]["fx"] += 1
     training.save_run(tmp_path / "other.npz", other)
     for command in ("evaluate", "show"):
         one_line(capsys, run(command, tmp_path / "other.npz"), "another camera")
 
 
-# --- collect, plan and the demo ------------------------------------------------------------------------------------------
+# --- collect, plan and the demo -------------------------------------------------------------------
 
 @needs_bullet
 def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsys):
-    assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures", "rings",
-               "--size", 96, 72, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
+    assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures",
+               "rings", "--size", 96, 72, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
     assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
     data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
     assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
@@ -181,9 +171,9 @@ def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsy
 
 
 @needs_bullet
-def test_plan_writes_a_record_an_animation_and_the_population(model, tmp_path, capsys):
-    assert run("plan", model, "--policy", "oracle", "--candidates", 8, "--iterations", 1, "--budget", 1, "--seed", 1,
-               "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
+def test_plan_writes_a_record_an_animation_and_the_population(small, tmp_path, capsys):
+    assert run("plan", small / "checkpoint.npz", "--policy", "oracle", "--candidates", 8, "--iterations", 1, "--budget",
+               1, "--seed", 1, "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
     out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
     assert "poke 1 to (" in out and "cm from the goals" in out
     assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
@@ -198,9 +188,9 @@ def test_plan_writes_a_record_an_animation_and_the_population(model, tmp_path, c
     (["--mark", 3, 3], ["--mark, --goal: expected both or neither"]), (["--click"], ["no display"]),
     (["--pixel-weight", -1], ["pixel_weight"]), (["--budget", 0], ["budget", "0"]), (["--seed", -1], ["seed", "-1"]),
     (["--objects", 2, "--obstacle"], ["movers", "obstacle"])])
-def test_plan_refuses_in_one_line(model, arguments, words, tmp_path, capsys, monkeypatch):
+def test_plan_refuses_in_one_line(small, arguments, words, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
-    one_line(capsys, run("plan", model, *arguments, "--out", tmp_path / "new"), *words)
+    one_line(capsys, run("plan", small / "checkpoint.npz", *arguments, "--out", tmp_path / "new"), *words)
     assert not (tmp_path / "new").exists()
 
 
@@ -252,7 +242,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     assert not list(tmp_path.glob("new/*"))
 
 
-# --- what is wrong ends in one line -----------------------------------------------------------------------------------
+# --- what is wrong ends in one line ---------------------------------------------------------------
 
 @pytest.mark.parametrize("arguments, words", [
     ("evaluate no.npz", ["no.npz", "no such file"]), ("evaluate pokes/shard_0000.npz", ["shard_0000.npz", "format"]),
@@ -267,11 +257,11 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     ("collect c --pokes -5", ["pokes", "-5"]), ("collect c --objects 0 3", ["objects"]),
     ("collect c --kinds teapot", ["kinds", "teapot"]), ("collect c --textures tartan", ["textures", "tartan"]),
     ("collect c --seed -1", ["seed"]), ("collect c --jobs 0", ["jobs"]), ("collect c --size 96 48", ["width", "96"])])
-def test_wrong_input_ends_in_one_line(arguments, words, train, tmp_path, capsys, monkeypatch):
+def test_wrong_input_ends_in_one_line(arguments, words, small, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("pokes").symlink_to(train)
+    Path("pokes").symlink_to(small / "train")
     Path("broken").mkdir()
-    Path("broken/shard_0000.npz").write_bytes((train / "shard_0000.npz").read_bytes()[:5000])
+    Path("broken/shard_0000.npz").write_bytes((small / "train/shard_0000.npz").read_bytes()[:5000])
     one_line(capsys, run(*arguments.split()), *words)
     assert {path.name for path in tmp_path.iterdir()} == {"broken", "pokes"}, "something was written"
 
@@ -284,7 +274,7 @@ def test_usage_errors_are_one_line_too(arguments, capsys):
     one_line(capsys, stop.value.code, "--weight" if "train" in arguments else "")
 
 
-# --- the program -------------------------------------------------------------------------------------------------------
+# --- the program ----------------------------------------------------------------------------------
 
 def test_module_and_installed_command_are_the_same_from_any_folder(tmp_path):
     for how in ([sys.executable, "-m", "hind4sight_min"], [str(Path(sys.executable).parent / "hind4sight")]):
@@ -298,8 +288,8 @@ def test_module_and_installed_command_are_the_same_from_any_folder(tmp_path):
 
 
 def test_what_takes_long_to_import_waits_until_it_is_needed():
-    code = ("import sys, hind4sight_min.lab.cli; "
-            "sys.exit(', '.join({'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules)) or 0)")
+    code = ("import sys, hind4sight_min.lab.cli; early = {'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules);"
+            "import hind4sight_min.lab.figures; sys.exit(str(early or {'matplotlib.pyplot'} & set(sys.modules) or '') or 0)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.eq1
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z: x becomes y, y becomes -x
 
 
-# --- unproject, rigid: from a depth picture to points in the arena --------------------------------------------------
+# --- unproject, rigid: from a depth picture to points in the arena ------------------------------------------------
 
 def camera_at(rotation, position):
     from hind4sight_min.geometry import Camera
@@ -59,7 +59,7 @@ def test_rigid_rotates_first_and_then_translates():
     assert_gradient(lambda points: rigid(points, pose), 0, np.random.default_rng(1).normal(size=(2, 4, 3)))
 
 
-# --- so3_exp: [R, T] of the network's rotation vectors --------------------------------------------------------------
+# --- so3_exp: [R, T] of the network's rotation vectors ------------------------------------------------------------
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     from hind4sight_min.geometry import so3_exp
@@ -92,7 +92,7 @@ def test_so3_exp_keeps_its_digits_at_small_angles_in_float32():
     assert_float32(so3_exp, 0, np.random.default_rng(2).normal(size=(4, 3)))
 
 
-# --- the transform layer -------------------------------------------------------------------------------------------
+# --- the transform layer ------------------------------------------------------------------------------------------
 
 def test_two_points_and_two_motions_by_hand():
     from hind4sight_min.geometry import transform_layer

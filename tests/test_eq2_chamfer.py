@@ -40,7 +40,7 @@ def test_two_points_against_two_by_hand():
 def test_gradient_of_two_points_against_two_by_hand():
     predicted, observed = on_a_line(0, 1), on_a_line(3, 8)
     assert_value(gradient_of(chamfer, 0, 1.0, predicted, observed)[0, :, 0], [2 * -3, 2 * -2 + 2 * -2 + 2 * -7], {
-        "the wrong sign": [6, 22], "the factor 2 of the square": [-3, -11],
+        "the wrong sign": [6, 22], "the factor 2 of the square, or a mean over 2 points": [-3, -11],
         "D_{P->P'} does not pull on P'": [-6, -4], "D_{P'->P} does not pull on P'": [0, -18],
         "a point that is nearest to several keeps only the last of them": [-6, -4 - 14]})
     assert_value(gradient_of(chamfer, 1, 1.0, predicted, observed)[0, :, 0], [2 * 3 + 2 * 2 + 2 * 2, 2 * 7], {
@@ -57,7 +57,7 @@ def test_chamfer_loss_sums_both_maps_for_each_interaction():
         assert_float32(chamfer_loss, argnum, *maps)
 
 
-# --- the nearest neighbour ------------------------------------------------------------------------------------------
+# --- the nearest neighbour ----------------------------------------------------------------------------------------
 
 def test_squared_distances_when_references_are_shared_or_unused():
     from hind4sight_min.ops import squared_distances
@@ -101,7 +101,7 @@ def test_the_clouds_of_a_batch_do_not_see_each_other():
         "neighbours sought in the whole batch": [[1], [1]]})
 
 
-# --- pixels without depth, and pixels that only one frame shows ----------------------------------------------------
+# --- pixels without depth, and pixels that only one frame shows ---------------------------------------------------
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_distance_maps_match_brute_force_and_live_each_on_its_own_grid(share):

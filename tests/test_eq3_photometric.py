@@ -13,7 +13,7 @@ B, H, W = 2, 4, 6
 N = H * W
 
 
-# --- the projection layer -------------------------------------------------------------------------------------------
+# --- the projection layer -----------------------------------------------------------------------------------------
 
 def camera_at(position):
     """Its x is the arena's y, its y the arena's -x."""
@@ -46,7 +46,7 @@ def test_gradients_of_project_and_optical_flow():
     assert_gradient(project, 0, behind, camera)
 
 
-# --- bilinear sampling ----------------------------------------------------------------------------------------------
+# --- bilinear sampling --------------------------------------------------------------------------------------------
 
 SQUARES = np.arange(1.0, 13).reshape(1, 3, 4, 1) ** 2  # rows 1 4 9 16, 25 36 49 64, 81 100 121 144
 
@@ -57,7 +57,8 @@ SQUARES = np.arange(1.0, 13).reshape(1, 3, 4, 1) ** 2  # rows 1 4 9 16, 25 36 49
     (2, 0.5, (9 + 49) / 2, {"x and y swapped": (81 + 100) / 2, "rounded": 9, "weights the wrong way round": 49}),
     (1.25, 1.75, (3 * 36 + 49 + 3 * (3 * 100 + 121)) / 16, {"weights the wrong way round": (36 + 3 * 49 + 100) / 16}),
     (3, 2, 144, {"the last row and column": 0}), (-5, 1.5, (25 + 81) / 2, {"0 outside the picture": 0}),
-    (0.5, 99, (81 + 100) / 2, {"0 outside the picture": 0})])
+    (0.5, 99, (81 + 100) / 2, {"0 outside the picture": 0}),
+    (1e12, 1.5, (64 + 144) / 2, {"an overflow": (25 + 81) / 2})])
 def test_bilinear_sample_by_hand(x, y, expected, mistakes):
     from hind4sight_min.ops import bilinear_sample
     found = bilinear_sample(SQUARES, np.array([[[[x, y]]]], float))
@@ -88,7 +89,7 @@ def test_bilinear_sample_matches_scipy_and_its_gradient_central_differences():
     assert_float32(bilinear_sample, 1, images, positions)
 
 
-# --- the loss -------------------------------------------------------------------------------------------------------
+# --- the loss -----------------------------------------------------------------------------------------------------
 
 def test_one_pixel_that_moves_by_hand():
     next_images = np.add.outer([0, 0.1, 0.2], [0, 0.01, 0.02, 0.03])[None, ..., None] * [1, 0, 2]  # 0.1 y + 0.01 x

@@ -20,7 +20,7 @@ def loss_of(flow, images, valid=None):
                                 if valid is None else valid)
 
 
-# --- by hand --------------------------------------------------------------------------------------------------------
+# --- by hand ------------------------------------------------------------------------------------------------------
 
 def test_one_pixel_that_moves_by_hand():
     # 3 x 3 pixels of one colour. Only the middle one moves, U = 2, V = -3: four steps of 2 in U and four of 3 in V.
@@ -56,7 +56,7 @@ def test_edge_weights_by_hand():
     assert_value(down, [np.exp([[-8, -6, -4]])], {"EDGE_SHARPNESS forgotten": [np.exp([[-0.2, -0.15, -0.1]])]})
 
 
-# --- against a loop over neighbours ---------------------------------------------------------------------------------
+# --- against a loop over neighbours -------------------------------------------------------------------------------
 
 def loop_smoothness(field, images, valid):
     """(B,): neighbour by neighbour."""
@@ -90,7 +90,7 @@ def test_flow_smoothness_and_its_gradient_match_a_loop():
     assert_float32(loss_of, 0, flow, images, valid)
 
 
-# --- pitfalls -------------------------------------------------------------------------------------------------------
+# --- pitfalls -----------------------------------------------------------------------------------------------------
 
 def test_a_constant_flow_costs_nothing_and_has_no_gradient_to_speak_of():
     from autograd import elementwise_grad

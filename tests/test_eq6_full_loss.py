@@ -50,7 +50,7 @@ def test_float32_stays_float32():
     assert all(gradient.dtype == np.float32 for gradient in grad(full_loss)(terms, weights).values())
 
 
-# --- the weights ----------------------------------------------------------------------------------------------------
+# --- the weights --------------------------------------------------------------------------------------------------
 
 def test_the_papers_weights_are_its_three_lambdas():
     from hind4sight_min.losses import PAPER_WEIGHTS

@@ -15,7 +15,7 @@ def test_flow_of_a_shifted_picture(peer):
     found = image_pairs.image_pair_flow(peer, picture[1:49, 3:67], picture[:48, 1:65])  # moves by (2, 1)
     assert found.shape == (48, 64, 2)
     np.testing.assert_allclose(np.median(found[8:-8, 8:-8], axis=(0, 1)), [2, 1], atol=0.05,
-                               err_msg="x and y swapped, before and after swapped, or in pixels of the enlarged picture?")
+                               err_msg="x and y, or before and after, swapped; or px of the enlarged picture?")
 
 
 def test_errors_against_a_made_up_flow(monkeypatch):

@@ -54,7 +54,7 @@ def test_a_record_needs_settings_with_a_grid(settings):
         replace(tiny_pokes(), meta={"settings": settings})
 
 
-# --- the grid ------------------------------------------------------------------------------------------------------
+# --- the grid -----------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("settings", [SETTINGS, {"arena": 0.6, "cell": 0.04}, {"arena": 0.3, "cell": 0.1}])
 def test_cells_and_centres_are_inverse(settings):
@@ -94,7 +94,7 @@ def test_the_occupied_grid_and_its_neighbours_against_loops():
             break
 
 
-# --- shards ----------------------------------------------------------------------------------------------------------
+# --- shards -------------------------------------------------------------------------------------------------------
 
 def test_a_shard_comes_back_as_it_was(tmp_path):
     saved, path = pokes_with_holes(), tmp_path / "deep" / "shard_0000.npz"

@@ -11,7 +11,7 @@ from scipy.special import log_softmax, softmax
 pytestmark = pytest.mark.inverse
 
 
-# --- by hand --------------------------------------------------------------------------------------------------------
+# --- by hand ------------------------------------------------------------------------------------------------------
 
 def test_cross_entropy_of_a_heatmap_by_hand():
     from hind4sight_min.losses import heatmap_cross_entropy
@@ -44,7 +44,7 @@ def test_inverse_loss_by_hand():
         "L_sim subtracted": [start + end - similar], "both heat-maps with the start": [start + np.log(10) + similar]})
 
 
-# --- against SciPy ----------------------------------------------------------------------------------------------------
+# --- against SciPy ------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("shift", [0.0, 1e4, -1e4])  # adding a number to all logits changes nothing
 def test_cross_entropy_and_its_gradient_match_scipy(shift):
@@ -94,7 +94,7 @@ def test_gradient_of_the_inverse_loss(argnum, name):
     assert_float32(inverse_loss, argnum, *inverse_inputs())
 
 
-# --- pitfalls -------------------------------------------------------------------------------------------------------
+# --- pitfalls -----------------------------------------------------------------------------------------------------
 
 def test_a_confident_heatmap_in_float32():
     from hind4sight_min.losses import heatmap_cross_entropy

@@ -37,24 +37,16 @@ def test_depth_noise_grows_with_depth():
     np.testing.assert_allclose(found.std(axis=(1, 2)), 0.01, rtol=0.06, err_msg="each picture has its own median")
 
 
-def test_depth_noise_scales_with_its_argument_and_repeats():
-    depth = two_levels().astype(float)
-    small, large, again = (add_depth_noise(depth, np.random.default_rng(1), sd) - depth for sd in (0.002, 0.008, 0.002))
-    np.testing.assert_allclose(large, 4 * small, rtol=1e-9, atol=1e-15)
-    np.testing.assert_array_equal(again, small)
-    np.testing.assert_array_equal(add_depth_noise(depth, np.random.default_rng(1), 0.0), depth)
-
-
-def test_depth_noise_keeps_missing_pixels_dtype_and_input():
+def test_depth_noise_keeps_missing_pixels_dtype_and_input_and_repeats():
     depth = two_levels()
     before = depth.copy()
     for deviation in (0.01, 2.0):  # never a negative depth, never a new missing pixel
-        noisy = add_depth_noise(depth, np.random.default_rng(0), deviation)
+        noisy, again = (add_depth_noise(depth, np.random.default_rng(0), deviation) for _ in range(2))
         assert noisy.dtype == np.float32
         np.testing.assert_array_equal(noisy > 0, depth > 0)
+        np.testing.assert_array_equal(again, noisy)
     np.testing.assert_array_equal(depth, before)
-    nothing = np.zeros((3, 4), np.float32)
-    np.testing.assert_array_equal(add_depth_noise(nothing, np.random.default_rng(0)), nothing)
+    np.testing.assert_array_equal(add_depth_noise(0 * depth, np.random.default_rng(0)), 0 * depth)
 
 
 @pytest.mark.parametrize("function, bad, named", [
@@ -103,10 +95,6 @@ def test_every_step_and_every_chunk_has_noise_of_its_own(same_pictures):
     training.train(same_pictures, random_run(replace(TINY, batch=10, steps=3)), objective)
     assert len(seen) == 30
     assert_noise_of_its_own(seen, same_pictures.depth_before[0], "steps, or chunks of a step,")
-    again = seen[:]
-    seen.clear()
-    training.train(same_pictures, random_run(replace(TINY, batch=10, steps=3)), objective)
-    np.testing.assert_array_equal(seen, again, err_msg="the same run has the same noise")
 
 
 def test_every_poke_of_an_evaluation_has_noise_of_its_own_and_always_the_same(same_pictures):
@@ -138,21 +126,12 @@ def test_noisy_depth_is_smoothed_in_both_frames():
 def test_association_is_uniform_over_the_window(window):
     depth = np.full((60, 70), 0.7, np.float32)
     found = associate_with_noise(depth, np.random.default_rng(2), window)
-    assert np.issubdtype(found.dtype, np.integer) and found.min() >= 0 and found.max() < depth.size
     v, u = np.mgrid[:60, :70]
     half = window // 2
     down, right = (shift[half:-half, half:-half] for shift in (found // 70 - v, found % 70 - u))
     assert np.abs(down).max() == np.abs(right).max() == half, "a window of n pixels reaches (n - 1) / 2 to each side"
     counts = np.bincount(((down + half) * window + right + half).ravel(), minlength=window ** 2)
     assert chisquare(counts).pvalue > 1e-3
-
-
-def test_association_without_a_window_is_exact_and_repeats():
-    depth = np.random.default_rng(0).uniform(0.5, 0.55, (7, 9))
-    np.testing.assert_array_equal(associate_with_noise(depth, np.random.default_rng(1), 1), np.arange(63).reshape(7, 9))
-    first, again, other = (associate_with_noise(depth, np.random.default_rng(seed), 5) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
 
 
 def test_association_at_the_border_keeps_the_pixel_itself():
@@ -167,10 +146,9 @@ def test_association_at_the_border_keeps_the_pixel_itself():
 def test_association_crosses_no_edge_of_the_depth_and_no_missing_pixel():
     depth = np.full((40, 40), 0.5)
     depth[:, 10:20], depth[:, 20:30], depth[:, 30:] = 0.5625, 0.6875, 0.5  # steps of 6.25, 12.5 and 18.75 cm
-    chosen = depth.ravel()[associate_with_noise(depth, np.random.default_rng(1), 7)]
-    assert np.abs(chosen - depth).max() == 0.0625, "the small step is crossed, the big ones are not"
-    wide = depth.ravel()[associate_with_noise(depth, np.random.default_rng(0), 7, threshold=0.125)]
-    assert np.abs(wide - depth).max() == 0.125, "at most: exactly the threshold still counts"
+    for threshold, step in ((0.10, 0.0625), (0.125, 0.125)):  # at most: exactly the threshold still counts
+        chosen = depth.ravel()[associate_with_noise(depth, np.random.default_rng(1), 7, threshold)]
+        assert np.abs(chosen - depth).max() == step
     rng = np.random.default_rng(3)
     depth = rng.uniform(0.02, 0.06, (40, 50))  # so near that missing (0) passes the depth gate
     depth[rng.random(depth.shape) < 0.3] = 0
@@ -208,19 +186,6 @@ def test_smooth_depth_against_the_sum_by_hand():
         assert abs(found[i, row, column] - expected) < 2e-5 < 1e-3 < abs(found[i, row, column] - depth[i, row, column])
 
 
-def test_smooth_depth_takes_noise_and_keeps_edges():
-    cam, empty = camera(64, 48, 80.0), np.full((48, 64), 0.9, np.float32)
-    clean, images = empty[None].repeat(2, axis=0), np.full((2, 48, 64, 3), 140, np.uint8)
-    clean[:, 20:30, 20:30] -= 0.06
-    images[:, 20:30, 20:30] = (200, 30, 30)
-    np.testing.assert_allclose(smooth_depth(clean, empty, images, cam), clean, atol=1e-3)  # without noise: no change
-    noisy = add_depth_noise(clean, np.random.default_rng(3), 0.01)
-    smooth = smooth_depth(noisy, empty, images, cam)
-    assert smooth.dtype == np.float32
-    assert (smooth - clean).std() < 0.25 * (noisy - clean).std()
-    assert np.abs(smooth - clean)[:, 22:28, 20].mean() < 0.006, "the object's rim flows out onto the table"
-
-
 def test_smoothing_is_the_same_in_metres_whatever_the_size_of_the_picture():
     left = []
     for scale in (1, 2):  # waves 8 cm long and 2 mm high on the table
@@ -230,5 +195,5 @@ def test_smoothing_is_the_same_in_metres_whatever_the_size_of_the_picture():
         smooth = smooth_depth((empty + waves)[None], empty, images, cam)[0] - empty
         middle = np.s_[cam.height // 2, cam.width // 4:-cam.width // 4]
         left.append(smooth[middle] @ np.broadcast_to(waves, smooth.shape)[middle] / np.sum(waves[middle[1]] ** 2))
-    # The reach is a whole number of pixels; a filter of as many pixels at both sizes leaves 0.31 and 0.73.
+    # The reach is a whole number of pixels; a filter of as many pixels at both sizes leaves 0.31 and 0.78.
     assert 0.1 < left[0] < 0.6 and left[1] == pytest.approx(left[0], rel=0.25), f"left of the waves: {left}"

@@ -72,7 +72,7 @@ def test_empty_scenes_are_refused():
         planning.goal_of([(3, 3)], empty)
 
 
-# --- legal pokes ------------------------------------------------------------------------------------------------------
+# --- legal pokes --------------------------------------------------------------------------------------------------
 
 def test_possible_starts_against_a_loop():
     rng = np.random.default_rng(5)
@@ -166,7 +166,7 @@ def test_the_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects()
     assert planning_cost(view.cloud[None], view, there, CAMERA, Search())[0] == 0
 
 
-# --- the cross entropy method ---------------------------------------------------------------------------------------
+# --- the cross entropy method -------------------------------------------------------------------------------------
 
 def bowl(sequences):
     """Lowest at (0.03, -0.05, pi): on the seam of the circle."""
@@ -257,7 +257,7 @@ def test_a_search_that_cannot_be(changes, named):
         Search(**changes)
 
 
-# --- plans --------------------------------------------------------------------------------------------------------------
+# --- plans --------------------------------------------------------------------------------------------------------
 
 def shift_along(view, length):
     """Rollouts of a model under which every poke shifts everything by `length` m along itself."""

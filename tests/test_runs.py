@@ -13,17 +13,6 @@ from hind4sight_min.lab.runs import train_saving
 from hind4sight_min.training import load_run, start_run
 
 
-class Stop(Exception):
-    pass
-
-
-def stop_after(steps):
-    def on_step(run, terms):
-        if run.step == steps:
-            raise Stop
-    return on_step
-
-
 def test_the_log_is_the_mean_over_the_steps_of_an_epoch(tmp_path):
     data, seen, told = tiny_pokes(count=20), [], []  # four steps an epoch, six in all
     run = start_run(TINY, data)
@@ -46,8 +35,12 @@ def test_a_resumed_run_is_the_same_run_with_the_same_log(stop, tmp_path):
     data = tiny_pokes(count=20)
     whole = start_run(TINY, data)
     train_saving(data, whole, tmp_path / "whole.npz")
-    with pytest.raises(Stop):
-        train_saving(data, start_run(TINY, data), tmp_path / "run.npz", save_every=0.0, on_step=stop_after(stop + 1))
+
+    def interrupt(run, terms):
+        if run.step == stop + 1:
+            raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        train_saving(data, start_run(TINY, data), tmp_path / "run.npz", save_every=0.0, on_step=interrupt)
     resumed = load_run(tmp_path / "run.npz")
     assert resumed.step == stop and bool(resumed.meta["sums"]) == (stop != 4)
     train_saving(data, resumed, tmp_path / "run.npz")

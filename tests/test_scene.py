@@ -90,14 +90,13 @@ def test_a_crop_is_the_part_of_the_picture_with_the_whole_box():
     for i in range(7):
         inside = (np.abs(before.points[i, :, :2] - box_of(pokes)[i]) < scene.REACH).all(axis=1) & before.valid[i]
         assert set(map(tuple, before.points[i, inside])) <= set(map(tuple, found.points[i]))
-        pixels = np.rint(project(found.points[i], data.camera)).astype(int)
         where = found.valid[i]
-        row, column = pixels[where][0]  # x, y
-        np.testing.assert_array_equal(found.images[i].reshape(-1, 3)[where], before.images[i][tuple(pixels[where].T[::-1])])
+        x, y = np.rint(project(found.points[i], data.camera)).astype(int)[where].T
+        np.testing.assert_array_equal(found.images[i].reshape(-1, 3)[where], before.images[i][y, x])
         for name in ("points", "valid", "occupied", "stands_out"):
             picture = getattr(before, name)[i].reshape(48, 64, -1)
             np.testing.assert_array_equal(getattr(found, name)[i][where].reshape(where.sum(), -1),
-                                          picture[tuple(pixels[where].T[::-1])], err_msg=name)
+                                          picture[y, x], err_msg=name)
     other = crop(after, pokes, data.camera)
     assert other.images.shape == found.images.shape  # the same part of both pictures
     found.images[:] = 0

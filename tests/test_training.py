@@ -17,7 +17,7 @@ from hind4sight_min.training import WEIGHTS, Recipe, loss_terms, make_batch, sta
 RNG = np.random.default_rng
 
 
-# --- batches -------------------------------------------------------------------------------------------------------
+# --- batches ------------------------------------------------------------------------------------------------------
 
 def test_a_batch_holds_the_cropped_scenes_the_evidence_of_whole_pictures_and_the_cells():
     data = tiny_pokes(cam=camera(64, 48, 77.0))
@@ -68,7 +68,7 @@ def test_image_noise_lets_a_motion_begin():
     assert loss(1 / 32, noise) < loss(0, noise) - 1e-3
 
 
-# --- the loss ------------------------------------------------------------------------------------------------------
+# --- the loss -----------------------------------------------------------------------------------------------------
 
 def test_every_term_gets_its_own_arguments():
     data, run = tiny_pokes(), random_run()
@@ -163,7 +163,7 @@ def test_every_term_reaches_masks_motions_and_encoder(name):
     assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
 
 
-# --- optimisers ----------------------------------------------------------------------------------------------------
+# --- optimisers ---------------------------------------------------------------------------------------------------
 
 def two_steps(optimiser, gradients):
     """The steps that an optimiser takes for two gradients in turn."""
@@ -224,7 +224,7 @@ def test_the_learning_rate_warms_up_and_falls_as_a_cosine():
     assert rates[-1] < 1e-3 and (np.diff(rates[10:]) < 0).all()
 
 
-# --- the loop ------------------------------------------------------------------------------------------------------
+# --- the loop -----------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("optimiser, rate", [("muon", 2e-2), ("adam", 2e-2)])
 def test_training_lowers_the_loss_it_trains(optimiser, rate):
@@ -307,7 +307,7 @@ def test_a_gradient_that_is_not_finite_stops_the_run_and_leaves_it_as_it_was():
     assert run.step == 0
 
 
-# --- checkpoints ---------------------------------------------------------------------------------------------------
+# --- checkpoints --------------------------------------------------------------------------------------------------
 
 def test_a_resumed_run_is_the_same_run(tmp_path):
     data, path = tiny_pokes(count=18), tmp_path / "run.npz"  # an epoch ends in the middle of the fourth step

@@ -6,7 +6,8 @@ can improve, starting from "nothing moves"?
 Equations:
 - Sec. III-A, a rigid motion [R, T] in SE(3): `geometry.so3_exp`; tests/test_eq1_transform.py
 - Eq. (1), transform layer: `geometry.transform_layer`; tests/test_eq1_transform.py
-- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`, `lab.evaluation.true_motion`; tests/test_evaluation.py
+- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`, `lab.evaluation.true_motion`; tests/test_sim_truth.py,
+  tests/test_evaluation.py
 
 Time: 4 s. Pictures: 02_masks.png, 02_blend.png, 02_exp.png, 02_zero.png.
 

@@ -7,9 +7,9 @@ Equations:
 - Sec. IV-A, background subtraction and the grid: `scene.scene_of`, `interactions.occupied_grid`,
   `interactions.cells_of`; tests/test_scene.py, tests/test_interactions.py
 - Sec. III-A and IV-A, a poke: `sim.arena.Arena.sample_poke`, `sim.arena.Arena.poke`, `geometry.poke_frame`;
-  tests/test_simulator.py, tests/test_geometry.py
-- Sec. IV-B, the data set: `sim.collection.collect_shard`; tests/test_simulator.py
-- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`; tests/test_evaluation.py
+  tests/test_sim_arena.py, tests/test_geometry.py
+- Sec. IV-B, the data set: `sim.collection.collect_shard`; tests/test_sim_collection.py
+- Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`; tests/test_sim_truth.py
 
 Time: 6 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
 

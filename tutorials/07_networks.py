@@ -75,7 +75,7 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 # `networks.predict` asks the *forward model* about these points and puts its answer back among the others.
 #
 # What a finger does to an object depends on where it meets it, which a perceptron learns slowly from coordinates:
-# `networks.first_met` says it, in weights over the points.
+# `networks.first_met` says it, in weights over the points. `networks.height_map` says what stands around the target.
 
 # %%
 ROW = 1

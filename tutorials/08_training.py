@@ -389,7 +389,7 @@ lesson.check("held-out: ratio before training", float(ratio[0]), 1, within=1e-3)
 lesson.check("held-out: ratio at the end", float(ratio[-1]), below=0.85 if options.quick else 0.45)
 lesson.check("animation [kB]", animation.stat().st_size / 1000, above=10, below=400)
 lesson.check("cover of moving / of still points, fresh", float(on[0] / off[0]), 1, within=0.25)
-lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=3 if options.quick else 6)
+lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=2 if options.quick else 6)
 if not options.quick:
     lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.4)
 print(f"{options.name}: all checks passed")

@@ -52,9 +52,7 @@ def progress_line(label):
 
 REPORT = (  # metric, unit, what it is, its baseline
     ("flow_epe_cm", "cm", "scene flow: error of moving points", "no_motion_epe_cm"),
-    ("flow_rmse_cm", "cm", "scene flow: root mean square", "no_motion_rmse_cm"),
     ("still_epe_cm", "cm", "scene flow: drift of still points", None),
-    ("all_epe_cm", "cm", "scene flow: error of all points", None),
     ("mask_iou", "", "masks: IoU of the moved objects", None),
     ("optical_epe_px", "px", "optical flow: error of moving pixels", "no_motion_optical_epe_px"),
     ("optical_epe_all_px", "px", "optical flow: error of all pixels", "no_motion_optical_epe_all_px"),
@@ -255,8 +253,8 @@ def click(image):
 # --- the demo ----------------------------------------------------------------------------------------------
 
 DEMO_POKES, DEMO_TEST_POKES, DEMO_STEPS = 2000, 200, 1000
-NO_BULLET = ("Without pybullet nothing can be simulated or planned, so this demo takes the shipped pokes; to get it, pip "
-             "install pybullet (ready-made for Python 3.11 and older; later versions compile it)")
+NO_BULLET = ("Without pybullet nothing can be simulated or planned, so this demo takes the shipped pokes; to get it: "
+             "pip install pybullet (ready-made for Python 3.11 and older; later versions compile it)")
 
 
 def run_demo(args):
@@ -296,15 +294,11 @@ def run_demo(args):
 # --- the command line -----------------------------------------------------------------------------------------
 
 def term_weight(text):
-    """'photometric=0.5' -> ('photometric', 0.5)."""
-    name, _, value = text.partition("=")
-    try:
-        if name in training.WEIGHTS:
-            return name, float(value)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"expected TERM=VALUE, a number for one of {', '.join(training.WEIGHTS)}, got "
-                                     f"{text!r}")
+    """'photometric=0.5' -> ('photometric', 0.5). Raises ValueError for anything else; argparse then says so."""
+    name, value = text.split("=")
+    if name not in training.WEIGHTS:
+        raise ValueError
+    return name, float(value)
 
 
 class OneLineParser(argparse.ArgumentParser):

@@ -34,13 +34,13 @@ TURN = np.pi / 4  # rad; goals are turned by at most this
 POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
 
-# --- tasks ----------------------------------------------------------------------------------------------------------
+# --- tasks --------------------------------------------------------------------------------------------------------
 
 @dataclass
 class Task:
     """A scene in its arena and a goal.
 
-    movers, marked (M,): which objects are to move, and which have a marked point: those, and perhaps one that shall stay.
+    movers, marked (M,): which objects are to move, and which have a marked point: those, perhaps one that shall stay.
     marks, goal_marks (M, 2) px: where these points are and shall be. goal: (rgb, depth) of the goal, or None where the
     user only said where the marks shall go. goal_poses (7, 7): as Arena.poses; truth, to measure by.
     """
@@ -160,7 +160,7 @@ def carried(points, objects, before, after):
     return (points + flow).astype(np.float32)
 
 
-# --- planners -------------------------------------------------------------------------------------------------------
+# --- planners -----------------------------------------------------------------------------------------------------
 
 def oracle_rollout(arena, view, labels, settings):
     """The simulator as a rollout: every sequence is carried out, and undone. labels (N + M,): truth."""
@@ -212,7 +212,7 @@ def next_plan(policy, task, view, labels, goal, run, search, rng, on_iteration=N
     return plan(rollout, view, goal, arena.camera, settings, search, rng, on_iteration)
 
 
-# --- the closed loop ------------------------------------------------------------------------------------------------
+# --- the closed loop ----------------------------------------------------------------------------------------------
 
 def scene_in(arena, rgb, depth):
     """One picture of an arena -> Scene."""
@@ -289,7 +289,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
 
 
 def save_record(path, record, meta):
-    """Write what `closed_loop` returned, whole or not at all; meta: seed, movers, obstacle of the task, for `replay`."""
+    """Write what `closed_loop` returned, whole or not at all; meta: the task's seed, movers, obstacle, for `replay`."""
     save_npz(path, record, {"format": FORMAT, **meta})
 
 

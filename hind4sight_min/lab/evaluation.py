@@ -18,7 +18,7 @@ MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objec
 AT_WALL = 0.012  # m; a poke ends at a wall where a point that it moved ends so near to one, about a pixel
 
 
-# --- what the model says of one poke ---------------------------------------------------------------------------------
+# --- what the model says of one poke ------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
 class Answer:
@@ -64,7 +64,7 @@ def poke_from_heatmaps(start_heatmap, end_heatmap, settings):
     return np.array([*target, np.arctan2(mean[1], mean[0])])
 
 
-# --- the errors of one poke ----------------------------------------------------------------------------------------
+# --- the errors of one poke ---------------------------------------------------------------------------------------
 
 def true_motion(interactions, truth, row):
     """What really happened in one interaction, from its depth without noise.
@@ -129,7 +129,7 @@ def errors_of_poke(run, interactions, truth, row, depth_noise=0.0):
             "at_wall": bool(ends.size) and ends.max() > interactions.settings["arena"] / 2 - AT_WALL}
 
 
-# --- the summary -------------------------------------------------------------------------------------------------------
+# --- the summary --------------------------------------------------------------------------------------------------
 
 def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
     """All metrics on a data set -> flat dict of floats; see `summary`. depth_noise: SD in m of noise on the depth that
@@ -144,7 +144,9 @@ def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
 
 
 def scenes_of_pokes(truth):
-    """Which scene each poke was made in, (M,) int: a scene goes on while its objects lie where the last poke left them."""
+    """Which scene each poke was made in, (M,) int: a scene goes on while its objects lie where the last poke left
+    them.
+    """
     fresh = np.any(truth.poses_before[1:] != truth.poses_after[:-1], axis=(1, 2))
     return np.concatenate([[0], np.cumsum(fresh)])
 
@@ -166,8 +168,8 @@ def summary(pokes, true_pokes, scenes):
 
     flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
     an interaction in which nothing moved has no moving point and so no say in it (it still counts for
-    still_epe_cm). The same for pokes that moved one object (single_), two or more (multi_), ended at a wall (wall_), and
-    without the hundredth of the pokes with the largest squared errors (trimmed_). flow_mse_cm2, flow_rmse_cm,
+    still_epe_cm). The same for pokes that moved one object (single_), two or more (multi_), ended at a wall (wall_),
+    and without the hundredth of the pokes with the largest squared errors (trimmed_). flow_mse_cm2, flow_rmse_cm,
     flow_epe_cm: over moving points; no_motion_* the same for predicting no motion. still_epe_cm: mean drift of points
     that do not move; all_epe_cm: of all points. mask_iou: mean over the objects that moved. optical_epe_px: over moving
     points; optical_epe_all_px: over all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a

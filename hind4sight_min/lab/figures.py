@@ -237,7 +237,7 @@ def training_figure(log):
     return figure
 
 
-# --- planning -------------------------------------------------------------------------------------------------------
+# --- planning -----------------------------------------------------------------------------------------------------
 
 def arrows_of(pokes, settings, camera):
     """Pokes (J, 3) as arrows of the shortest length: starts and targets, pixels (J, 2) each. Not in the paper."""
@@ -352,7 +352,7 @@ def control_figure(curves, pokes):
     return figure
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files --------------------------------------------------------------------------------------------------------
 
 def save_figure(figure, path):
     """Write a figure as PNG, whole or not at all; the same figure gives the same bytes, however often.

@@ -14,8 +14,7 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     The log has a dict for each epoch: epoch, step, learning_rate, and the mean of every term. It is kept in
     run.meta["log"], the sums of an unfinished epoch in run.meta["sums"], and the seconds spent, over all calls, in
     run.meta["seconds"]; so a run that was resumed has the log of one that was not. The log also goes beside `path`, as
-    CSV. jobs: processes; the result does not depend on it. on_step(run, terms) and on_epoch(entry of the log) are called
-    after each.
+    CSV. jobs: processes, on which the result does not depend. on_step(run, terms), on_epoch(entry): called after each.
     """
     check_whole("jobs", jobs, 1)
     recipe, meta, per_epoch = run.recipe, run.meta, max(1, len(data) // run.recipe.batch)

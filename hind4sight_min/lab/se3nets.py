@@ -60,7 +60,7 @@ def true_targets(data, points, depth, window, rng):
 
 
 def supervised(params, recipe, data, rng, window=1, depth_noise=0.0):
-    """The objective of SE3-Nets, for `training.train`: {"association": (B,)}. data: Supervised; depth_noise: SD in m."""
+    """The objective of SE3-Nets, for `training.train`: {"association": (B,)}. data: Supervised; depth_noise: SD, m."""
     seen, pokes = data.interactions, data.interactions.pokes
     if depth_noise:
         seen = with_depth_noise(seen, depth_noise, rng)

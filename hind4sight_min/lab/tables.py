@@ -44,7 +44,7 @@ _3D = {name: training.WEIGHTS[name] for name in ("chamfer", "distance_smoothness
 
 NOISES = {"clean": 0.0, "noisy": 0.01}  # m, SD of the depth noise in training and test
 
-# name -> (what the table says, weights, window in pixels of SE3-Nets' association noise, flow MSE in the paper's Table I
+# name -> (what the table says, weights, window in pixels of SE3-Nets' association noise, the paper's flow MSE, Table I,
 # without and with noise). SE3-Nets is our network with its loss. The paper gives windows of 9 and 11 pixels but not the
 # picture's size; SE3-Nets' has 320 columns, five times ours, where they span what 3 pixels do here. Both are shown.
 # The paper prints "MSE (cm)". We read its numbers as squared errors in cm^2, as the name says; read as lengths, it is
@@ -271,7 +271,7 @@ def tables_text(tables, figures):
                        for name in tables)
 
 
-# --- planning (Sec. IV-G) ------------------------------------------------------------------------------------------
+# --- planning (Sec. IV-G) -----------------------------------------------------------------------------------------
 
 # name -> (what the table says, control.POLICIES, what its search changes)
 PLANNERS = {

@@ -72,7 +72,7 @@ class Settings:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
 
 
-# --- the camera ----------------------------------------------------------------------------------------------------
+# --- the camera ---------------------------------------------------------------------------------------------------
 
 def look_at(eye, target):
     """Camera pose (4, 4) arena_from_camera at `eye`, looking at `target` (both (3,), m, arena), z up.
@@ -98,7 +98,7 @@ def arena_camera(width, height):
                   look_at([0, -0.46, 0.62], [0, -0.018, 0]))
 
 
-# --- the arena -----------------------------------------------------------------------------------------------------
+# --- the arena ----------------------------------------------------------------------------------------------------
 
 class Arena:
     """One Bullet world: a walled table, a finger on three prismatic joints, a camera. A context manager.

@@ -6,7 +6,7 @@ physical properties"; the shapes and textures are ours. An outline has its corne
 import cv2
 import numpy as np
 
-# --- shapes --------------------------------------------------------------------------------------------------------
+# --- shapes -------------------------------------------------------------------------------------------------------
 
 def rectangle(x0, y0, x1, y1):
     """The outline of a rectangle."""
@@ -89,7 +89,7 @@ def mesh(outlines, height, taper):
     return vertices, normals, uvs, indices
 
 
-# --- textures ------------------------------------------------------------------------------------------------------
+# --- textures -----------------------------------------------------------------------------------------------------
 
 TEXTURES = ("stripes", "checks", "dots", "patches", "rings", "zigzag")
 HELD_OUT = {"kinds": ("wedge", "cross"), "textures": ("rings", "zigzag")}  # never in the defaults
