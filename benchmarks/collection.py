@@ -12,7 +12,7 @@ from pathlib import Path
 
 from race import parser_of, spread
 
-from hind4sight_min.files import write_json
+from hind4sight_min.disk.files import write_json
 from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.sim.collection import collect
 

@@ -62,15 +62,16 @@ WORK = """
 import json, sys, time
 from functools import partial
 from hind4sight_min import interactions, training
+from hind4sight_min.disk import shards
 from hind4sight_min.lab import evaluation, noise
 from hind4sight_min.sim.truth import load_truth
 train, fresh, out, recipe, noise_sd = json.loads(sys.argv[1])
-data = interactions.load_interactions(train)
+data = shards.load_interactions(train)
 run, start = training.start_run(training.Recipe(**recipe), data), time.process_time()
 objective = partial(noise.under_noise, standard_deviation=noise_sd) if noise_sd else training.unsupervised
 training.train(data, run, objective)
 seconds = time.process_time() - start
-found = evaluation.evaluate(run, interactions.load_interactions(fresh), load_truth(fresh), depth_noise=noise_sd)
+found = evaluation.evaluate(run, shards.load_interactions(fresh), load_truth(fresh), depth_noise=noise_sd)
 open(out, "w").write(json.dumps({**found, "train_cpu_seconds": seconds}))
 """
 

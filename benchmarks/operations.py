@@ -20,7 +20,7 @@ from autograd import grad, value_and_grad
 from race import ROOT, fastest, parser_of, race, ratios, report, serve, shown, spread
 
 from hind4sight_min import losses
-from hind4sight_min.files import write_json
+from hind4sight_min.disk.files import write_json
 
 CHAMFER = ("ours", "torch_1_threads", "torch_2_threads", "point_cloud_utils")
 WARP = ("ours", "torch_1_threads", "torch_2_threads", "scipy")

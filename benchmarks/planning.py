@@ -7,7 +7,7 @@ One step is what the robot waits for between two pokes: the default candidates, 
 planning.Search, on one core, for the start of test scene 0 with two objects to move. Medians over the rounds; each
 checkout plans with the model it ships, and every turn of it is three steps in a process of its own.
 """
-from hind4sight_min import planning, training  # before NumPy: it sets the number of BLAS threads
+from hind4sight_min import planning  # before NumPy: it sets the number of BLAS threads
 
 import json
 import statistics
@@ -21,13 +21,14 @@ from pathlib import Path
 import numpy as np
 from race import DATA, ROOT, parser_of, ratios, spread, start
 
-from hind4sight_min.files import write_json
+from hind4sight_min.disk.checkpoints import load_run
+from hind4sight_min.disk.files import write_json
 from hind4sight_min.lab.control import first_look, random_task
 
 
 def measure(rounds):
     """Plan so many steps -> the figures."""
-    run, search, seconds = training.load_run(DATA / "checkpoint.npz"), planning.Search(), []
+    run, search, seconds = load_run(DATA / "checkpoint.npz"), planning.Search(), []
     with random_task(0, 2) as task:
         camera, settings = task.arena.camera, task.settings
         _, view, goal = first_look(task)

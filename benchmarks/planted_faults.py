@@ -84,7 +84,7 @@ PLANTED = (
          "heatmap_cross_entropy(end_logits, start_cells)"),
         ("mean over the terms, not the batch", "float(len(total))", "float(len(terms))")]),
 
-    ("files.py", "files", [
+    ("disk/files.py", "files", [
         ("a half-written file stays behind", "temporary.unlink(missing_ok=True)", "pass"),
         ("files may run code", "allow_pickle=False", "allow_pickle=True")]),
 
@@ -93,7 +93,8 @@ PLANTED = (
         ("the corner of a cell for its centre", "axis=-1) + 0.5) * settings", "axis=-1) + 0.0) * settings"),
         ("the finger comes down in a wall", '< settings["arena"] / 2 - settings["finger_radius"]',
          '< settings["arena"] / 2'),
-        ("four neighbours, not eight", "np.ones((3, 3), np.uint8)", "cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))"),
+        ("four neighbours, not eight", "np.ones((3, 3), np.uint8)", "cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))")]),
+    ("disk/shards.py", "interactions", [
         ("depth cut off, not rounded", "np.round(arrays[name] / DEPTH_UNIT)", "np.floor(arrays[name] / DEPTH_UNIT)")]),
 
     ("scene.py", "scene", [
@@ -114,7 +115,7 @@ PLANTED = (
         ("points that do not count shift a mask's centroid", "take(masks, (..., slice(1, None))) * valid[..., None]",
          "take(masks, (..., slice(1, None)))"),
         ("T = R c - c + t", "centroids - turned + take", "turned - centroids + take"),
-        ("points that only fill a row up are moved", "anp.where(counts, found.points, points[pick])", "found.points"),
+        ("points that only fill a row up are moved", "anp.where(counts, found.points, looked)", "found.points"),
         ("L_sim trains the encoder that compares",
          "encode({name: getval(value) for name, value in params.items()}, points)", "encode(params, points)"),
         ("the inverse model's two maps swapped", "take(logits, (..., 0)), take(logits, (..., 1))",
@@ -133,7 +134,8 @@ PLANTED = (
         ("every seed starts from the same weights", "np.random.default_rng(recipe.seed)", "np.random.default_rng(0)"),
         ("every seed has the same order of pokes", "[recipe.seed, 1, epoch]", "[1, epoch]"),
         ("the same noise at every step", "[recipe.seed, 2, run.step, i]", "[recipe.seed, 2, i]"),
-        ("chunks added up, not averaged", "share = {}, len(interactions) / recipe.batch", "share = {}, 1.0"),
+        ("chunks added up, not averaged", "share = {}, len(interactions) / recipe.batch", "share = {}, 1.0")]),
+    ("disk/checkpoints.py", "training", [
         ("a resumed run forgets its moments", "arrays.get(name, np.zeros(size, np.float32))",
          "np.zeros(size, np.float32)")]),
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from race import parser_of, shown, spread
 
-from hind4sight_min.files import write_json
+from hind4sight_min.disk.files import write_json
 
 
 def main():

@@ -25,8 +25,8 @@ from race import DATA, fastest, parser_of, race, ratios, report, serve, shown, s
 from scipy.spatial import cKDTree
 
 from hind4sight_min import losses, networks, training
-from hind4sight_min.files import write_json
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.files import write_json
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.ops import unflatten
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hind4sight_min import networks, scene, training
 from hind4sight_min.geometry import poke_frame
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.figures import PALETTE, save_figure
 
 from matplotlib.figure import Figure

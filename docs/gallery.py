@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 from PIL import Image
 
-from hind4sight_min.files import whole_file, write_text
+from hind4sight_min.disk.files import whole_file, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 TUTORIALS, PAGE, PICTURES = ROOT / "tutorials", ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery"

@@ -24,9 +24,9 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
-from hind4sight_min.files import write_json, write_text
+from hind4sight_min.disk.files import write_json, write_text
 from hind4sight_min.lab import image_pairs, tables
-from hind4sight_min.training import load_run, save_run
+from hind4sight_min.disk.checkpoints import load_run, save_run
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS, README = ROOT / "docs" / "results", ROOT / "README.md"

@@ -12,9 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from hind4sight_min import losses, training  # before NumPy: it sets the number of BLAS threads
-from hind4sight_min.files import write_text
+from hind4sight_min.disk import checkpoints
+from hind4sight_min.disk.files import write_text
 from hind4sight_min.geometry import optical_flow
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab import evaluation
 from hind4sight_min.lab.cli import data_small
 from hind4sight_min.lab.figures import blend, draw_arrow, flow_to_rgb, on_table, save_figure, show_image
@@ -181,7 +182,7 @@ def main():
     parser.add_argument("--out", type=Path, default=DOCS, help="folder of understanding.md and the pictures")
     args = parser.parse_args()
     interactions, truth = load_interactions(data_small() / "test"), load_truth(data_small() / "test")
-    shipped = training.load_run(data_small() / "checkpoint.npz")
+    shipped = checkpoints.load_run(data_small() / "checkpoint.npz")
     save_figure(landscape(interactions, truth), args.out / "landscape.png")
     save_figure(failures(shipped, interactions, truth), args.out / "failures.png")
     save_figure(emergent(shipped, interactions, truth), args.out / "emergent.png")

@@ -4,7 +4,7 @@ Frames: *arena* (z up, origin in the middle of the table surface) and *camera* (
 Units: metres, radians, pixels (a pixel's centre has integer coordinates). What the losses go through is
 differentiable by autograd; float32 in gives float32 out.
 """
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import autograd.numpy as anp
 import numpy as np
@@ -47,6 +47,11 @@ class Camera:
     def camera_from_arena(self):
         """(4, 4) float64: maps arena points to camera points."""
         return np.linalg.inv(self.arena_from_camera)
+
+    @property
+    def plain(self):
+        """The camera as plain numbers and lists, for files: Camera(**plain) is the same one."""
+        return {**asdict(self), "arena_from_camera": self.arena_from_camera.tolist()}
 
     @property
     def pixel_size(self):

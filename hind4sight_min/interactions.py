@@ -1,20 +1,16 @@
-"""The record of one poke, shards of them on disk, and the arena's grid of cells.
+"""The record of pokes as the robot sees them, and the arena's grid of cells.
 
-A data set is a folder of shards `shard_0000.npz`, each describing itself (camera, units, seed, simulator settings,
-format version). Beside each lies a `shard_0000.truth.npz` with what the simulator knows and the robot does not see:
-that is read by sim/truth.py, which no file here imports.
+On disk it is a folder of shards (disk/shards.py). What the simulator knows of a poke and the robot does not see is a
+record of its own (sim/truth.py), which nothing in the core can read.
 """
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from .files import load_npz, save_npz
 from .geometry import Camera
 
-FORMAT = "hind4sight_min interactions 1"
-DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
+PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
 
 
 @dataclass
@@ -74,9 +70,6 @@ class Interactions:
         return self.meta["settings"]
 
 
-PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
-
-
 # --- the arena's grid of cells: heat-maps live on it, and pokes are drawn on it ----------------------------------
 
 def grid_shape(settings):
@@ -124,57 +117,3 @@ def finger_fits(places, grid, settings):
     taken = with_neighbours(grid).reshape(len(grid), -1)
     inside = np.abs(places).max(axis=2) < settings["arena"] / 2 - settings["finger_radius"]
     return inside & ~taken[np.arange(len(grid))[:, None], cells_of(places, settings)]
-
-
-# --- shards on disk -----------------------------------------------------------------------------------
-
-def save_shard(path, interactions):
-    """Write one shard, whole or not at all."""
-    meta = {**interactions.meta, "format": FORMAT, "camera": asdict(interactions.camera),
-            "units": {"depth": DEPTH_UNIT, "pokes": "m, m, rad", "starts": "m"}}
-    meta["camera"]["arena_from_camera"] = interactions.camera.arena_from_camera.tolist()
-    arrays = {name: getattr(interactions, name) for name in (*PER_POKE, "empty_depth")}
-    for name in ("depth_before", "depth_after", "empty_depth"):
-        arrays[name] = np.clip(np.round(arrays[name] / DEPTH_UNIT), 0, 65535).astype(np.uint16)
-    save_npz(path, arrays, meta)
-
-
-def load_shard(path):
-    """One shard -> Interactions. Raises ValueError naming the file and what is wrong with it."""
-    arrays, meta = load_npz(path, FORMAT)
-    try:
-        camera = Camera(**meta["camera"])
-        for name in ("depth_before", "depth_after", "empty_depth"):
-            arrays[name] = arrays[name].astype(np.float32) * np.float32(meta["units"]["depth"])
-        return Interactions(**arrays, camera=camera, meta=meta)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def find_shards(folder):
-    """The shards of a data set, in order, without their truth files; none where there is no folder."""
-    return sorted(path for path in Path(folder).glob("shard_*.npz") if not path.name.endswith(".truth.npz"))
-
-
-def shards_in(folder):
-    """The shards of a data set, in order. Raises ValueError if there is none."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"{folder}: no such folder")
-    shards = find_shards(folder)
-    if not shards:
-        raise ValueError(f"{folder}: no shard_*.npz in it; 'hind4sight collect' makes them")
-    return shards
-
-
-def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions. They must share camera, arena and grid."""
-    paths = shards_in(folder)
-    parts = [load_shard(path) for path in paths]
-    first = parts[0]
-    for path, part in zip(paths, parts):
-        same = all(part.settings[name] == first.settings[name] for name in ("arena", "cell"))
-        if (part.meta["camera"] != first.meta["camera"] or not same
-                or not np.array_equal(part.empty_depth, first.empty_depth)):
-            raise ValueError(f"{path}: another camera, arena or grid than the folder's first shard")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POKE}
-    return Interactions(**joined, empty_depth=first.empty_depth, camera=first.camera, meta=first.meta)

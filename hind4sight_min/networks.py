@@ -2,11 +2,8 @@
 
 Every network is the same small perceptron applied to each point, plus *context*: pooled features of the whole cloud and
 a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
-once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3.
-
-The paper's forward model is that of SE3-Nets with a projection layer; ours is smaller. docs/architecture.md has each
-box of Fig. 3 with its function here, docs/not-in-the-paper.md what is ours alone (`height_map`, `pooling_weights`,
-`first_met`, the bounds of masks and all constants).
+once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3, whose boxes docs/architecture.md names; the paper's
+forward model is that of SE3-Nets, ours is smaller.
 """
 from dataclasses import dataclass
 
@@ -99,8 +96,8 @@ FINGER = 0.014  # m; half the width of what the finger sweeps: its radius and ha
 
 
 def first_met(local, valid):
-    """Where the finger first meets something on its straight way to the target: weights (B, N) in [0, 1], 0 where it
-    meets nothing. Not in the paper: a perceptron learns it slowly.
+    """Where the finger first meets something on its way to the target: weights (B, N) in [0, 1], 0 where it meets
+    nothing. Not in the paper: a perceptron learns it slowly.
 
     A disc of radius FINGER that ends in the origin pushes a point (x, y) of its way by d = sqrt(FINGER^2 - y^2) - x;
     the deepest one is met first. local (B, N, 3) m, poke frame; valid (B, N) bool.
@@ -108,8 +105,7 @@ def first_met(local, valid):
     x, y, z = local[..., 0], local[..., 1], local[..., 2]
     central = np.sqrt(np.maximum(0, 1 - (y / FINGER) ** 2))  # 0 beside the way
     depth = FINGER * central - x
-    # The finger comes down at most 14 cm before the target.
-    met = valid & (z > ABOVE) & (central > 0) & (x > -0.16) & (depth > 0)
+    met = valid & (z > ABOVE) & (central > 0) & (x > -0.16) & (depth > 0)  # it comes down at most 14 cm before
     deepest = (depth * met).max(axis=1, keepdims=True)
     return met * central * np.exp((depth * met - deepest) / 0.004)
 
@@ -198,8 +194,7 @@ def forward_model(params, sizes, points, valid, pokes):
         bias = layer(params, f"context_{i}", context(h), leaky=False)
         h = dense(h, params[f"trunk_{i}_w"], bias, leaky=True, residual=True)
 
-    # The background's logit is 0, a mover's bounded: a mask that the optimiser once pushed to nothing (it
-    # overshoots) would have no gradient left to come back with.
+    # The background's logit is 0, a mover's bounded: a mask pushed to nothing would have no gradient to come back with.
     movers = MASK_BOUND * anp.tanh(layer(params, "mask", h, leaky=False) / MASK_BOUND)
     masks = softmax(anp.concatenate([np.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, M, K)
     rotations, translations = _motions(params, h, masks, context(h), local, valid)
@@ -215,9 +210,8 @@ def softmax(logits):
     return e / anp.sum(e, axis=-1, keepdims=True)
 
 
-# Of [translation, rotation], in m and rad. The optimiser moves every weight by the learning rate, however small its
-# gradient, and a motion is a sum over `head` of them: with 5 cm and 1 rad the first steps fling the points about, and
-# the masks withdraw from that within a hundred steps.
+# Of [translation, rotation], in m and rad. The optimiser moves every weight by the learning rate, and a motion is a sum
+# of many: with 5 cm and 1 rad the first steps fling the points about, and the masks withdraw within a hundred steps.
 MOTION_UNIT = np.array([0.005] * 3 + [0.1] * 3, np.float32)
 
 
@@ -244,18 +238,16 @@ def _motions(params, h, masks, seen, local, valid):
 
 
 def predict(params, sizes, scene, pokes):
-    """What pokes (B, 3) do to a Scene -> Prediction of all its N points.
+    """The one way to ask the model what pokes (B, 3) do to a Scene -> Prediction of all its N points.
 
-    The one way to ask the model: the forward model on the points that `scene.look` finds; all others are background
-    that stays. Training, evaluation and planning all call this.
+    The forward model on the points that `scene.look` finds; all others are background that stays.
     """
-    rows, seen = look(scene, pokes)
-    pick, points = at_rows(rows), scene.points
-    found = forward_model(params, sizes, points[pick], seen, pokes)
+    (rows, seen), points = look(scene, pokes), scene.points
+    looked, counts = points[at_rows(rows)], seen[..., None]
+    found = forward_model(params, sizes, looked, seen, pokes)
     background = np.eye(sizes.masks, dtype=points.dtype)[0]
-    counts = seen[..., None]
     still = np.broadcast_to(background, points.shape[:2] + background.shape)
-    return Prediction(put_rows(points, rows, anp.where(counts, found.points, points[pick])),
+    return Prediction(put_rows(points, rows, anp.where(counts, found.points, looked)),
                       put_rows(still, rows, anp.where(counts, found.masks, background)),
                       found.rotations, found.translations)
 
@@ -268,9 +260,8 @@ STATE_GAIN = 3.0  # L_sim beside the cross entropies; of 1, 3, 10 and more: see 
 def state_embedding(params, points, occupied):
     """s_t, the sum of the encoder's features over the points of objects. Paper: Sec. III-E.
 
-    Of the predicted cloud it is the predicted s'_{t+1}, of the observed one s_{t+1}: an encoder that tells pokes apart
-    also tells how a prediction differs from what happened. The gradient of L_sim stops here: it goes to the points,
-    not to the encoder, which would end up saying nothing, for then all clouds are alike (docs/research-log.md).
+    Of the predicted cloud it is s'_{t+1}, of the observed one s_{t+1}. The gradient of L_sim stops here: it goes to the
+    points, not to the encoder, which would end up saying nothing, for then all clouds are alike (docs/research-log.md).
     (B, N, 3) m arena, occupied (B, N) bool -> (B, E).
     """
     features = encode({name: getval(value) for name, value in params.items()}, points)

@@ -1,20 +1,17 @@
-"""Unsupervised training: the recipe, a batch, the loss of Eq. (6), two optimisers, one loop, checkpoints."""
+"""Unsupervised training: the recipe, a batch, the loss of Eq. (6), two optimisers, one loop."""
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from autograd import grad
 from autograd.tracer import getval
 
 from . import check_whole, losses
-from .files import load_npz, plain, save_npz
 from .geometry import Camera, optical_flow
 from .interactions import cell_centres, cells_of
 from .networks import Sizes, init_parameters, inverse_model, predict, state_embedding
 from .ops import at_rows, take, unflatten
 from .scene import Scene, crop, look, most_changed, scene_of
-
-FORMAT = "hind4sight_min checkpoint 5"
 
 # From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
 # See docs/research-log.md.
@@ -193,7 +190,7 @@ def start_run(recipe, interactions):
     """A fresh Run for a data set."""
     params = init_parameters(recipe.sizes, np.random.default_rng(recipe.seed))
     vector = np.concatenate([value.ravel() for value in params.values()])
-    meta = {"camera": plain(asdict(interactions.camera)), "settings": interactions.settings}
+    meta = {"camera": interactions.camera.plain, "settings": interactions.settings}
     return Run(recipe, {name: value.shape for name, value in params.items()}, vector,
                np.zeros_like(vector), np.zeros_like(vector), meta=meta)
 
@@ -272,40 +269,8 @@ def train(data, run, objective=unsupervised, map=map, on_step=None):
     return run
 
 
-# --- checkpoints -------------------------------------------------------------------------------------------
-
 def check_camera(run, camera):
     """Raise ValueError when a run was trained with another camera than this one."""
     trained = Camera(**run.meta["camera"])
     if not all(np.allclose(getattr(trained, name), getattr(camera, name), rtol=1e-6) for name in vars(camera)):
         raise ValueError("camera: another camera than the checkpoint was trained with")
-
-
-def save_run(path, run, resumable=True):
-    """Write a checkpoint, whole or not at all. Without the optimiser's state it is a third of the size."""
-    arrays = {"vector": run.vector}
-    if resumable:
-        arrays.update(first_moment=run.first_moment, second_moment=run.second_moment)
-    save_npz(path, arrays, {"format": FORMAT, "recipe": asdict(run.recipe), "layout": run.layout, "step": run.step,
-                            "run": run.meta})
-
-
-def load_run(path):
-    """Read a checkpoint -> Run. Raises ValueError naming the file and what is wrong, the layer too if one differs."""
-    arrays, meta = load_npz(path, FORMAT)
-    try:
-        recipe = Recipe(**{**meta["recipe"], "sizes": Sizes(**meta["recipe"]["sizes"])})
-        template = init_parameters(recipe.sizes, np.random.default_rng(0))
-        layout, found = {name: value.shape for name, value in template.items()}, meta["layout"]
-        for name in {**layout, **found}:
-            if list(layout.get(name, ())) != found.get(name, []):
-                raise ValueError(f"{name}: this network has a layer of shape {layout.get(name)}, the checkpoint "
-                                 f"{found.get(name)}")
-        size = sum(value.size for value in template.values())
-        for name, value in arrays.items():
-            if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"{name}: expected {size} finite numbers, got shape {value.shape}")
-        moments = (arrays.get(name, np.zeros(size, np.float32)) for name in ("first_moment", "second_moment"))
-        return Run(recipe, layout, arrays["vector"], *moments, meta["step"], meta["run"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from hind4sight_min import training
-from hind4sight_min.interactions import load_interactions, save_shard
+from hind4sight_min.disk import checkpoints
+from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.lab import cli
 from hind4sight_min.lab.cli import data_small, main
 from hind4sight_min.networks import encode, predict, state_embedding
@@ -35,7 +36,7 @@ def one_line(capsys, status, *words):
 
 
 def vector(path):
-    return training.load_run(path).vector
+    return checkpoints.load_run(path).vector
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_the_same_seed_writes_the_same_checkpoint_and_never_needs_the_truth(smal
 def test_options_of_train_are_those_of_the_recipe(small, tmp_path):
     assert run("train", small / "train", tmp_path / "a.npz", *TINY, "--masks", 4, "--seed", 5, "--optimiser", "adam",
                "--weight", "chamfer=0", "--weight", "photometric=0.7", "--learning-rate", 0.01) == 0
-    recipe = training.load_run(tmp_path / "a.npz").recipe
+    recipe = checkpoints.load_run(tmp_path / "a.npz").recipe
     assert (recipe.steps, recipe.batch, recipe.seed, recipe.optimiser) == (3, 2, 5, "adam")
     assert (recipe.sizes.width, recipe.sizes.masks, recipe.learning_rate) == (8, 4, 0.01)
     assert recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
@@ -85,13 +86,13 @@ def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(small, tmp_pa
         def after(run, terms):
             if run.step == 2:
                 raise KeyboardInterrupt
-        training.train(interactions, run, objective, on_step=lambda *done: (training.save_run(path, run), after(*done)))
+        training.train(interactions, run, objective, on_step=lambda *done: (checkpoints.save_run(path, run), after(*done)))
     monkeypatch.setattr(cli, "train_saving", stop)
     assert run("train", small / "train", stopped, *noisy) == 130
     assert capsys.readouterr().err.strip().endswith("what is on disk is whole")
     monkeypatch.setattr(cli, "train_saving", save)
     one_line(capsys, run("train", small / "train", stopped, "--resume", "--weight", "inverse=0"), "--resume", "weight")
-    assert training.load_run(stopped).step == 2
+    assert checkpoints.load_run(stopped).step == 2
     assert run("train", small / "train", stopped, "--resume") == 0
     np.testing.assert_array_equal(vector(stopped), vector(whole), "resumed without its noise?")
 
@@ -126,7 +127,7 @@ def test_the_report_shows_every_kind_of_poke_that_there_is(capsys):
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
-    run, data = training.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
+    run, data = checkpoints.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
     _, gradient = training.chunk_gradient(training.unsupervised, run.vector, run.layout, run.recipe, data, [0])
     for name, part in training.unflatten(gradient, run.layout).items():
         if name != "heatmaps_b":  # the same for all cells: softmax does not see it
@@ -150,9 +151,9 @@ def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_
 
 
 def test_a_checkpoint_of_another_camera_is_refused(small, tmp_path, capsys):
-    other = training.load_run(small / "checkpoint.npz")
+    other = checkpoints.load_run(small / "checkpoint.npz")
     other.meta["camera"]["fx"] += 1
-    training.save_run(tmp_path / "other.npz", other)
+    checkpoints.save_run(tmp_path / "other.npz", other)
     for command in ("evaluate", "show"):
         one_line(capsys, run(command, tmp_path / "other.npz"), "another camera")
 
@@ -250,7 +251,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     ("train pokes out.npz --steps -1", ["steps", "-1"]), ("train pokes out.npz --batch 0", ["batch"]),
     ("train pokes out.npz --masks 1", ["masks"]), ("train pokes out.npz --jobs 0", ["jobs"]),
     ("train pokes out.npz --optimiser sgd", ["optimiser", "sgd"]),
-    ("train pokes out.npz --depth-noise -1", ["standard_deviation", "-1"]),
+    ("train pokes out.npz --depth-noise -1 --jobs 1", ["standard_deviation", "-1"]),
     ("train pokes out.npz --weight chamfer=-1", ["weights"]),
     ("train pokes out.npz --resume", ["out.npz", "no such file"]), ("train pokes", ["out", ".npz"]),
     ("train pokes model.png", ["out", ".npz", "model.png"]), ("reproduce planning --out p --jobs 0", ["jobs", "0"]),

@@ -10,6 +10,7 @@ from test_planning import CAMERA, island
 from tiny import SETTINGS
 
 from hind4sight_min import planning, training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import project, unproject
 from hind4sight_min.lab import control
 from hind4sight_min.lab.cli import data_small
@@ -22,7 +23,7 @@ SMALL = Search(candidates=16, elites=4, iterations=2)
 
 @pytest.fixture(scope="module")
 def run():
-    return training.load_run(data_small() / "checkpoint.npz")
+    return checkpoints.load_run(data_small() / "checkpoint.npz")
 
 
 @pytest.fixture(scope="module")

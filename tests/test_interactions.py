@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tiny import SETTINGS, camera, tiny_pokes
 
-from hind4sight_min.files import load_npz, save_npz
-from hind4sight_min.interactions import (DEPTH_UNIT, FORMAT, PER_POKE, cell_centres, cells_of, finger_fits,
-                                         grid_shape, load_interactions, load_shard, occupied_grid, save_shard, shards_in,
+from hind4sight_min.disk.files import load_npz, save_npz
+from hind4sight_min.disk.shards import DEPTH_UNIT, FORMAT, load_interactions, load_shard, save_shard, shards_in
+from hind4sight_min.interactions import (PER_POKE, cell_centres, cells_of, finger_fits, grid_shape, occupied_grid,
                                          with_neighbours)
 
 

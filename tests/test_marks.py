@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from tiny import SETTINGS, camera, tiny_pokes
 
 from hind4sight_min.geometry import project
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.marks import follow, places_at, points_at
 from hind4sight_min.networks import Prediction
 from hind4sight_min.planning import view_of

@@ -10,7 +10,8 @@ import pytest
 
 from hind4sight_min import reproduce
 from hind4sight_min.interactions import write_json
-from hind4sight_min.training import FORMAT, load_run, save_run
+from hind4sight_min.disk.checkpoints import load_run, save_run
+from hind4sight_min.training import FORMAT
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()

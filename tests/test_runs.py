@@ -10,7 +10,8 @@ from tiny import TINY, tiny_pokes
 from hind4sight_min import training
 from hind4sight_min.lab import runs
 from hind4sight_min.lab.runs import train_saving
-from hind4sight_min.training import load_run, start_run
+from hind4sight_min.disk.checkpoints import load_run
+from hind4sight_min.training import start_run
 
 
 def test_the_log_is_the_mean_over_the_steps_of_an_epoch(tmp_path):

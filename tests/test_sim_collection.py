@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hind4sight_min.geometry import unproject
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.processes import worker_pool
 from hind4sight_min.sim import collection
 from hind4sight_min.sim.arena import Arena, Settings

@@ -4,8 +4,8 @@ import pytest
 import tiny
 from scipy.spatial.transform import Rotation
 
-from hind4sight_min.files import load_npz, save_npz
-from hind4sight_min.interactions import FORMAT, save_shard
+from hind4sight_min.disk.files import load_npz, save_npz
+from hind4sight_min.disk.shards import FORMAT, save_shard
 from hind4sight_min.sim.truth import Truth, load_truth, save_truth, true_scene_flow, truth_path
 
 

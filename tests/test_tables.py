@@ -11,6 +11,7 @@ from test_se3nets import moved_blocks
 from tiny import TINY
 
 from hind4sight_min import training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.lab import control, evaluation, runs, se3nets, tables
 from hind4sight_min.lab.tables import MODELS, Cell, Scale
 from hind4sight_min.sim.collection import collect
@@ -89,7 +90,7 @@ def test_a_cell_goes_on_where_it_was_and_is_run_once(tmp_path, small_world, monk
     monkeypatch.setattr(runs, "save_run", stop_at_two)
     with pytest.raises(KeyboardInterrupt):
         tables.run_cell(cell, tmp_path / "parts", TINY_SCALE, save_every=0.0)
-    assert training.load_run(parts / "full_clean_long-1.npz").step == 2
+    assert checkpoints.load_run(parts / "full_clean_long-1.npz").step == 2
     monkeypatch.setattr(runs, "save_run", save)
     again = tables.run_cell(cell, tmp_path / "parts", TINY_SCALE)
     assert {**again, "train_seconds": 0} == {**whole, "train_seconds": 0}
@@ -113,7 +114,7 @@ def test_a_cell_is_trained_and_evaluated_under_its_noise(model, tmp_path, small_
     monkeypatch.setattr(evaluation, "evaluate", lambda *_, depth_noise=0.0, **data: told.append(depth_noise) or {})
     for noise in ("clean", "noisy"):
         tables.run_cell(Cell(model, noise, 1), tmp_path, TINY_SCALE)
-        trained.append(training.load_run(tmp_path / "cells" / f"{model}_{noise}-1.npz"))
+        trained.append(checkpoints.load_run(tmp_path / "cells" / f"{model}_{noise}-1.npz"))
     assert told == [run.meta["depth_noise"] for run in trained] == [0.0, 0.01]
     assert not np.array_equal(trained[0].vector, trained[1].vector)
 
@@ -218,7 +219,7 @@ def test_the_outcome_of_a_run_by_hand():
 
 def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
-    training.save_run(tmp_path / "run.npz", training.start_run(TINY, moved_blocks().interactions))
+    checkpoints.save_run(tmp_path / "run.npz", training.start_run(TINY, moved_blocks().interactions))
     asked = []
     monkeypatch.setattr(control, "closed_loop", lambda task, run, policy, search, budget, seed: asked.append(
         (policy, search, seed)) or record([0.1, len(asked) / 100, 0.05]))
@@ -229,7 +230,7 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
     assert [policy for policy, *_ in asked] == ["learned", "greedy", "learned"]
     assert (asked[0][1].chamfer_weight, asked[0][1].horizon, asked[2][1].horizon) == (0, 1, 2)
     assert len({tuple(np.random.default_rng(seed).random(3)) for *_, seed in asked}) == 3, "all tries are the same"
-    training.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), moved_blocks().interactions))
+    checkpoints.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), moved_blocks().interactions))
     with pytest.raises(ValueError, match="made with another"):
         run_scene("pixels", 1, 0)
 

@@ -8,6 +8,7 @@ from autograd import grad
 from tiny import SETTINGS, SIZES, TINY, camera, doubled, random_run, tiny_pokes
 
 from hind4sight_min import losses, networks, training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import optical_flow
 from hind4sight_min.interactions import cell_centres, cells_of
 from hind4sight_min.ops import unflatten
@@ -314,12 +315,12 @@ def test_a_resumed_run_is_the_same_run(tmp_path):
     whole = train(data, start_run(TINY, data))
 
     def stop_at_two(run, terms):
-        training.save_run(path, run)
+        checkpoints.save_run(path, run)
         if run.step == 2:
             raise KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt):
         train(data, start_run(TINY, data), on_step=stop_at_two)
-    resumed = training.load_run(path)
+    resumed = checkpoints.load_run(path)
     assert resumed.step == 2 and resumed.recipe == TINY
     train(data, resumed)
     for name in ("vector", "first_moment", "second_moment"):
@@ -328,12 +329,12 @@ def test_a_resumed_run_is_the_same_run(tmp_path):
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path):
     run = train(tiny_pokes(), start_run(TINY, tiny_pokes()))
-    training.save_run(tmp_path / "a.npz", run)
-    loaded = training.load_run(tmp_path / "a.npz")
+    checkpoints.save_run(tmp_path / "a.npz", run)
+    loaded = checkpoints.load_run(tmp_path / "a.npz")
     assert loaded.recipe == run.recipe and loaded.layout == run.layout and loaded.meta == run.meta
-    training.save_run(tmp_path / "b.npz", run, resumable=False)
+    checkpoints.save_run(tmp_path / "b.npz", run, resumable=False)
     assert (tmp_path / "b.npz").stat().st_size < 0.6 * (tmp_path / "a.npz").stat().st_size
-    np.testing.assert_array_equal(training.load_run(tmp_path / "b.npz").vector, run.vector)
+    np.testing.assert_array_equal(checkpoints.load_run(tmp_path / "b.npz").vector, run.vector)
 
 
 def spoil_vector(run):
@@ -357,9 +358,9 @@ def drop_layer(run):
 def test_a_checkpoint_that_does_not_fit_names_what_differs(tmp_path, spoil, said):
     run, path = random_run(), tmp_path / "run.npz"
     spoil(run)
-    training.save_run(path, run)
+    checkpoints.save_run(path, run)
     with pytest.raises(ValueError, match=f"run.npz: {said}"):
-        training.load_run(path)
+        checkpoints.load_run(path)
 
 
 def test_a_checkpoint_of_another_camera_is_refused():

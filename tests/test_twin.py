@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hind4sight_min import training
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.shards import load_interactions
 
 torch = pytest.importorskip("torch", reason="PyTorch is only installed with the extra 'bench'")
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,5 +1,5 @@
 """Pokes that need no simulator: a block on a tilted view of a table, somewhere else afterwards. For tests only."""
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ def tiny_pokes(count=7, seed=0, cam=None):
             places[when, i] = middle[:2]
     pokes = np.column_stack([places.mean(axis=0), rng.uniform(-3, 3, count)]).astype(np.float32)
     starts = pokes[:, :2] - 0.11 * np.stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2])], axis=1)
-    meta = {"settings": SETTINGS, "camera": {**asdict(cam), "arena_from_camera": cam.arena_from_camera.tolist()}}
+    meta = {"settings": SETTINGS, "camera": cam.plain}
     return Interactions(rgb[0], rgb[1], depth[0], depth[1], pokes, starts, depth_of(0.0), cam, meta)
 
 

@@ -36,6 +36,7 @@ import numpy as np
 from autograd import grad
 
 from hind4sight_min import geometry, losses, networks, ops, training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.interactions import cell_centres, cells_of, grid_shape
 from hind4sight_min.lab.evaluation import poke_errors, poke_from_heatmaps, true_motion
 from hind4sight_min.lab.figures import PALETTE, blend, draw_arrow, flow_to_rgb
@@ -45,7 +46,7 @@ options = lesson.begin("07_networks")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 data, truth = lesson.pokes()
-shipped = training.load_run(lesson.data_small() / "checkpoint.npz")
+shipped = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 fresh = training.start_run(shipped.recipe, data)
 sizes, camera, settings = shipped.recipe.sizes, data.camera, data.settings
 count = {name: int(np.prod(shape)) for name, shape in shipped.layout.items()}

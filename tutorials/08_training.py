@@ -30,6 +30,7 @@ import numpy as np
 from matplotlib.animation import PillowWriter
 
 from hind4sight_min import losses, networks, ops, training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import optical_flow, project
 from hind4sight_min.lab.evaluation import matched_iou, true_motion
 from hind4sight_min.lab.figures import PALETTE, TERMS, blend, flow_to_rgb
@@ -44,7 +45,7 @@ camera = train.camera
 recipe = training.Recipe(steps=200)
 if options.quick:
     recipe = training.Recipe(steps=80, batch=8, warmup=15, learning_rate=3e-3)
-shipped = training.load_run(lesson.data_small() / "checkpoint.npz")
+shipped = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 
 # %% [markdown]
 # ## What a step does

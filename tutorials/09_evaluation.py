@@ -30,6 +30,7 @@ import lesson  # first of all: it sets the number of BLAS threads
 import numpy as np
 
 from hind4sight_min import training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.interactions import cell_centres
 from hind4sight_min.lab import evaluation, tables
 from hind4sight_min.lab.figures import PALETTE
@@ -42,7 +43,7 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 
 POKES = 40 if options.quick else 80
 data, truth = (part[np.arange(POKES)] for part in lesson.pokes())
-run = training.load_run(lesson.data_small() / "checkpoint.npz")
+run = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 errors = [evaluation.errors_of_poke(run, data, truth, row) for row in range(POKES)]  # a dict for each poke
 metrics = evaluation.summary(errors, data.pokes, evaluation.scenes_of_pokes(truth))
 

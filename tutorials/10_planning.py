@@ -26,6 +26,7 @@ import lesson  # first of all: it sets the number of BLAS threads
 import numpy as np
 
 from hind4sight_min import planning, training
+from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import project
 from hind4sight_min.lab import control, figures
 from hind4sight_min.lab.evaluation import true_motion
@@ -37,7 +38,7 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 
 SEARCH = planning.Search(iterations=3) if options.quick else planning.Search()
 MOVERS = 1  # objects to move, 1 to 3
-run = training.load_run(lesson.data_small() / "checkpoint.npz")
+run = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 
 # %% [markdown]
 # ## A scene, a goal, and one marked point

@@ -3,8 +3,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from hind4sight_min.files import whole_file  # before NumPy is loaded: the package sets the number of BLAS threads
-from hind4sight_min.interactions import load_interactions
+from hind4sight_min.disk.files import whole_file  # before NumPy is loaded: the package sets the number of BLAS threads
+from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.cli import data_small
 from hind4sight_min.sim.truth import load_truth
 

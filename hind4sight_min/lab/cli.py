@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from .. import check_whole, planning, training
-from ..files import write_json
+from ..disk import checkpoints
+from ..disk.files import write_json
 from ..geometry import project
-from ..interactions import load_interactions
+from ..disk.shards import load_interactions
 from ..networks import Sizes
 from ..sim.arena import Settings
 from ..sim.collection import collect
@@ -121,7 +122,7 @@ def run_train(args):
                          "change")
     if out.exists() and not args.resume:
         raise ValueError(f"{out}: exists already; --resume goes on with it")
-    run, show = training.load_run(out) if args.resume else new_run(interactions, **given), progress_line("train")
+    run, show = checkpoints.load_run(out) if args.resume else new_run(interactions, **given), progress_line("train")
 
     def on_step(run, terms):
         if show:
@@ -140,7 +141,7 @@ def run_train(args):
 
 
 def run_evaluate(args):
-    run, interactions = training.load_run(args.checkpoint), load_interactions(args.data)
+    run, interactions = checkpoints.load_run(args.checkpoint), load_interactions(args.data)
     training.check_camera(run, interactions.camera)
     metrics = evaluation.evaluate(run, interactions, load_truth(args.data), progress_line("evaluate"))
     print_metrics(metrics)
@@ -149,7 +150,8 @@ def run_evaluate(args):
 
 def run_show(args):
     from . import figures
-    run, interactions, truth = training.load_run(args.checkpoint), load_interactions(args.data), load_truth(args.data)
+    run = checkpoints.load_run(args.checkpoint)
+    interactions, truth = load_interactions(args.data), load_truth(args.data)
     training.check_camera(run, interactions.camera)
     row = args.row
     if row is None:  # a poke that moved something well, not the best one
@@ -188,7 +190,7 @@ SEARCH_OPTIONS = "candidates", "iterations", "horizon", "pixel_weight", "chamfer
 
 
 def run_plan(args):
-    run, options = training.load_run(args.checkpoint), {name: getattr(args, name) for name in SEARCH_OPTIONS}
+    run, options = checkpoints.load_run(args.checkpoint), {name: getattr(args, name) for name in SEARCH_OPTIONS}
     if (args.mark is None) != (args.goal is None):
         raise ValueError("--mark, --goal: expected both or neither; --goal says where a marked point shall go")
     own = args.click or args.mark is not None

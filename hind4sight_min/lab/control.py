@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from .. import check_whole
-from ..files import load_npz, save_npz
+from ..disk.files import load_npz, save_npz
 from ..geometry import project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict

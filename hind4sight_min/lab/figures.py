@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.patheffects import Normal, withStroke
 
-from ..files import whole_file
+from ..disk.files import whole_file
 from ..geometry import project
 from ..interactions import grid_shape
 from ..losses import distance_maps, seen_in_both, warp_backward

@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ..interactions import DEPTH_UNIT
+from ..disk.shards import DEPTH_UNIT
 from ..training import unsupervised
 
 

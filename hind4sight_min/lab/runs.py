@@ -3,8 +3,9 @@ import time
 from pathlib import Path
 
 from .. import check_whole
-from ..files import write_text
-from ..training import CHUNK, learning_rate, save_run, train, unsupervised
+from ..disk.files import write_text
+from ..disk.checkpoints import save_run
+from ..training import CHUNK, learning_rate, train, unsupervised
 from .processes import parallel_map
 
 

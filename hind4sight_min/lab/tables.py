@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import check_whole, planning, training
-from ..files import plain, write_json
-from ..interactions import load_interactions
+from ..disk import checkpoints
+from ..disk.files import plain, write_json
+from ..disk.shards import load_interactions
 from ..sim.arena import Settings
 from ..sim.collection import collect
 from ..sim.objects import HELD_OUT
@@ -159,7 +160,7 @@ def run_cell(cell, out, scale, save_every=60.0):
 
     def compute():
         data = _data(out / "train")
-        run = training.load_run(path) if path.exists() else training.start_run(recipe, data.interactions)
+        run = checkpoints.load_run(path) if path.exists() else training.start_run(recipe, data.interactions)
         if run.recipe != recipe:
             raise ValueError(f"{path}: made with another recipe; remove it, or choose another --out")
         run.meta["depth_noise"] = noise
@@ -171,7 +172,7 @@ def run_cell(cell, out, scale, save_every=60.0):
         return {**metrics, "train_seconds": run.meta["seconds"]}
 
     return once(path.with_suffix(".json"), {
-        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": training.FORMAT,
+        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": checkpoints.FORMAT,
         "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes}, compute)
 
 
@@ -294,7 +295,7 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
     planner: of PLANNERS, or "greedy"; movers 0: an obstacle scene. attempt: another one has other random numbers.
     """
     _, policy, changes = PLANNERS.get(planner, ("", planner, {})) if movers else ("", planner, AHEAD)
-    run, search = training.load_run(checkpoint), planning.Search(**changes)
+    run, search = checkpoints.load_run(checkpoint), planning.Search(**changes)
 
     def compute():
         with control.random_task(seed, max(movers, 1), obstacle=movers == 0) as task:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import check_whole
-from ..files import plain
-from ..interactions import Interactions, find_shards, load_shard, save_shard
+from ..disk.files import plain
+from ..disk.shards import find_shards, load_shard, save_shard
+from ..interactions import Interactions
 from .arena import Arena, Settings
 from .truth import Truth, save_truth, truth_path
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import load_npz, save_npz
-from ..interactions import FORMAT, load_shard, shards_in
+from ..disk.files import load_npz, save_npz
+from ..disk.shards import FORMAT, load_shard, shards_in
 
 
 @dataclass
