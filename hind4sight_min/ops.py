@@ -60,8 +60,8 @@ def nearest_squared_distances(queries, references, valid):
     if not valid.any(axis=1).all():
         raise ValueError("valid: expected at least one valid reference in every cloud")
     found = np.zeros(q.shape[:2], bool)
-    if q.shape == r.shape:  # a query that coincides with its own pixel's reference needs no search: most never moved
-        found = valid & (q[..., 0] == r[..., 0]) & (q[..., 1] == r[..., 1]) & (q[..., 2] == r[..., 2])
+    if q.shape == r.shape:  # who coincides with the reference of its own index need not ask: most points never moved
+        found = valid & np.logical_and.reduce([q[..., axis] == r[..., axis] for axis in range(q.shape[2])])
     indices = np.arange(len(q))[:, None] * r.shape[1] + np.arange(q.shape[1])
     for i in range(len(q)):
         rows, asked = np.flatnonzero(valid[i]), ~found[i]
@@ -82,8 +82,8 @@ def bilinear_sample(images, positions):
 
     images (B, H, W, C) float; positions (B, h, w, 2) px, (x right, y down), pixel centres at whole numbers
     -> (B, h, w, C). Outside the picture it is the nearest border pixel (with gradient 0 to the position).
-    cv2.remap does it; OpenCV 4 rounds positions to 1/32 px, OpenCV 5 only for float64 images and more than four
-    channels. Raises ValueError for other shapes or positions that are not finite (OpenCV would silently read 0).
+    cv2.remap does it; OpenCV 4 rounds positions to 1/32 px, OpenCV 5 only for float64 images and for two channels or
+    more than four. Raises ValueError for other shapes or positions that are not finite (OpenCV would silently read 0).
     """
     if images.ndim != 4 or positions.ndim != 4 or positions.shape[::3] != (len(images), 2) or not positions.size:
         raise ValueError("images, positions: expected (B, H, W, C) and (B, h, w, 2) with h, w >= 1, "
@@ -112,7 +112,7 @@ def _bilinear_position_vjp(ans, images, positions):
             for axis, size in enumerate(images.shape[2:0:-1]):
                 if size > 1:
                     cell = list(maps)
-                    cell[axis] = np.minimum(np.floor(maps[axis]), size - 2)
+                    cell[axis] = np.floor(maps[axis])
                     slope = _remap(np.diff(images[i], axis=1 - axis), *cell)
                     slope *= g[i]
                     along = positions[i, ..., axis]

@@ -31,6 +31,13 @@ def test_a_scene_holds_the_points_and_what_background_subtraction_says_of_them()
         assert found.stands_out[i, v * 16 + u] == around
 
 
+@pytest.mark.parametrize("nearer, is_object", [(0.0081, True), (0.0079, False)])
+def test_an_object_is_nearer_than_the_empty_arena_by_more_than_8_mm(nearer, is_object):
+    data = tiny_pokes(count=1)
+    depth = (data.empty_depth - np.float32(nearer))[None]
+    assert scene_of(depth, data.rgb_before, data.empty_depth, data.camera, 0.5).occupied.any() == is_object
+
+
 def test_what_stands_outside_the_walls_is_no_object():
     data = tiny_pokes()
     narrow = scene_of(data.depth_before, data.rgb_before, data.empty_depth, data.camera, 0.1)
