@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from hind4sight_min.disk import checkpoints
 from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.lab import cli
 from hind4sight_min.lab.cli import data_small, main
-from hind4sight_min.networks import encode, predict, state_embedding
+from hind4sight_min.lab.noise import under_noise
+from hind4sight_min.networks import Sizes, encode, predict, state_embedding
 from hind4sight_min.sim.truth import load_truth, save_truth
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,12 +61,19 @@ def test_train_writes_a_checkpoint_its_log_and_a_picture(small):
     assert json.loads((small / "checkpoint.json").read_text())["loss_step"] == 3
 
 
-def test_the_same_seed_writes_the_same_checkpoint_and_never_needs_the_truth(small, tmp_path):
+def test_train_does_what_the_loop_does_and_never_needs_the_truth(small, tmp_path):
     (tmp_path / "pokes").mkdir()
     (tmp_path / "pokes" / "shard_0000.npz").symlink_to(small / "train" / "shard_0000.npz")
-    for seed in (0, 1):
-        assert run("train", tmp_path / "pokes", tmp_path / f"{seed}.npz", *TINY, "--seed", seed) == 0
-        assert np.array_equal(vector(tmp_path / f"{seed}.npz"), vector(small / "checkpoint.npz")) == (seed == 0)
+    data, sizes = load_interactions(small / "train"), Sizes(width=8)
+    for seed, noise in ((0, 0), (1, 0), (0, 0.01)):
+        path, objective = tmp_path / f"{seed}-{noise}.npz", training.unsupervised
+        options = ["--seed", seed, *(["--depth-noise", noise] if noise else [])]
+        assert run("train", tmp_path / "pokes", path, *TINY, *options) == 0
+        if noise:
+            objective = partial(under_noise, standard_deviation=noise)
+        expected = training.start_run(training.Recipe(steps=3, batch=2, seed=seed, sizes=sizes), data)
+        training.train(data, expected, objective)
+        np.testing.assert_array_equal(vector(path), expected.vector, err_msg=f"seed {seed}, noise {noise}")
 
 
 def test_options_of_train_are_those_of_the_recipe(small, tmp_path):
@@ -76,25 +85,16 @@ def test_options_of_train_are_those_of_the_recipe(small, tmp_path):
     assert recipe.weights == {**training.WEIGHTS, "chamfer": 0, "photometric": 0.7}
 
 
-def test_an_interrupted_run_goes_on_as_the_same_run_with_its_noise(small, tmp_path, capsys, monkeypatch):
+def test_a_resumed_run_is_the_same_run_with_its_noise(small, tmp_path, capsys):
     noisy, whole, stopped = [*TINY, "--depth-noise", 0.01], tmp_path / "whole.npz", tmp_path / "stopped.npz"
     assert run("train", small / "train", whole, *noisy) == 0
-    assert not np.allclose(vector(whole), vector(small / "checkpoint.npz"), atol=1e-6), "depth noise changes nothing"
-    save = cli.train_saving
-
-    def stop(interactions, run, path, objective, jobs, on_step, on_epoch):
-        def after(run, terms):
-            if run.step == 2:
-                raise KeyboardInterrupt
-        training.train(interactions, run, objective, on_step=lambda *done: (checkpoints.save_run(path, run), after(*done)))
-    monkeypatch.setattr(cli, "train_saving", stop)
-    assert run("train", small / "train", stopped, *noisy) == 130
-    assert capsys.readouterr().err.strip().endswith("what is on disk is whole")
-    monkeypatch.setattr(cli, "train_saving", save)
+    half = cli.new_run(load_interactions(small / "train"), steps=3, batch=2, width=8, depth_noise=0.01)
+    for _ in range(2):
+        training.training_step(load_interactions(small / "train"), half, partial(under_noise, standard_deviation=0.01))
+    checkpoints.save_run(stopped, half)
     one_line(capsys, run("train", small / "train", stopped, "--resume", "--weight", "inverse=0"), "--resume", "weight")
-    assert checkpoints.load_run(stopped).step == 2
     assert run("train", small / "train", stopped, "--resume") == 0
-    np.testing.assert_array_equal(vector(stopped), vector(whole), "resumed without its noise?")
+    np.testing.assert_array_equal(vector(stopped), vector(whole), err_msg="resumed without its noise?")
 
 
 def test_an_existing_checkpoint_is_not_overwritten(small, tmp_path, capsys):
@@ -267,6 +267,14 @@ def test_wrong_input_ends_in_one_line(arguments, words, small, tmp_path, capsys,
     assert {path.name for path in tmp_path.iterdir()} == {"broken", "pokes"}, "something was written"
 
 
+def test_an_interrupt_ends_in_one_line(monkeypatch, capsys):
+    def interrupted(args):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(cli, "run_evaluate", interrupted)
+    assert run("evaluate") == 130
+    assert capsys.readouterr().err == "\nhind4sight evaluate: stopped; what is on disk is whole\n"
+
+
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["collect"], ["evaluate", "--json"], *(
     ["train", "data", "out.npz", "--weight", wrong] for wrong in ("chamfers=1", "chamfer", "chamfer=much"))])
 def test_usage_errors_are_one_line_too(arguments, capsys):
@@ -289,8 +297,9 @@ def test_module_and_installed_command_are_the_same_from_any_folder(tmp_path):
 
 
 def test_what_takes_long_to_import_waits_until_it_is_needed():
-    code = ("import sys, hind4sight_min.lab.cli; early = {'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules);"
-            "import hind4sight_min.lab.figures; sys.exit(str(early or {'matplotlib.pyplot'} & set(sys.modules) or '') or 0)")
+    code = ("import sys, hind4sight_min.lab.cli; wrong = {'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules);"
+            "import hind4sight_min.lab.figures; wrong |= {'matplotlib.pyplot'} & set(sys.modules);"
+            "sys.exit(f'imported too early: {wrong}' if wrong else 0)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

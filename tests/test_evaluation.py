@@ -89,7 +89,10 @@ def test_a_point_moves_when_its_motion_is_longer_than_a_millimetre(oracle, shift
 def test_missing_depth_is_not_scored(oracle):
     data = tiny_pokes()
     data.depth_before[:, 3, 4:8] = 0  # a third of the block
-    assert metrics(oracle, 0.5, data=data)["all_epe_cm"] == pytest.approx(8 * 2.5 / 188, rel=1e-3)
+    found = metrics(oracle, 0.5, data=data)
+    assert found["all_epe_cm"] == pytest.approx(8 * 2.5 / 188, rel=1e-3)
+    for name in ("optical_epe", "no_motion_optical_epe"):
+        assert found[f"{name}_all_px"] == pytest.approx(found[f"{name}_px"] * 8 / 188), name
 
 
 def test_an_object_that_turned_is_scored_point_by_point(oracle):

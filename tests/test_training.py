@@ -223,6 +223,11 @@ def test_the_learning_rate_warms_up_and_falls_as_a_cosine():
     rates = [training.learning_rate(recipe, step) for step in range(100)]
     assert rates[0] == pytest.approx(0.05) and max(rates) < 0.5 and rates[50] == pytest.approx(0.25)
     assert rates[-1] < 1e-3 and (np.diff(rates[10:]) < 0).all()
+    run = random_run(replace(TINY, optimiser="adam"))
+    before = run.vector
+    training.training_step(tiny_pokes(), run)
+    first = np.abs(run.vector - before).max()  # of Adam: the rate itself
+    assert first == pytest.approx(training.learning_rate(run.recipe, 0), rel=1e-3), "another step's rate"
 
 
 # --- the loop -----------------------------------------------------------------------------------------------------
