@@ -13,7 +13,7 @@ import pytest
 from hind4sight_min import training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.disk.shards import load_interactions, save_shard
-from hind4sight_min.lab import cli
+from hind4sight_min.lab import cli, control
 from hind4sight_min.lab.cli import data_small, main
 from hind4sight_min.lab.noise import under_noise
 from hind4sight_min.networks import Sizes, encode, predict, state_embedding
@@ -141,10 +141,12 @@ def test_every_layer_of_the_shipped_checkpoint_is_alive():
     assert np.abs(said - then).sum() < 0.6 * np.abs(now - then).sum(), "no nearer to the next state than this one is"
 
 
-def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_path, capsys):
-    for options, said in ((["--row", 5], "interaction 5\n"), ([], "interaction 135\n")):
+def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_path, capsys, monkeypatch):
+    asked, ask = [], cli.evaluation.ask
+    monkeypatch.setattr(cli.evaluation, "ask", lambda run, data, row: asked.append(row) or ask(run, data, row))
+    for options, row in ((["--row", 5], 5), ([], 135)):
         assert run("show", small / "checkpoint.npz", *options, "--out", tmp_path / "poke.png") == 0
-        assert capsys.readouterr().out.endswith(said)
+        assert capsys.readouterr().out.endswith(f"interaction {row}\n") and asked.pop() == row
         assert (tmp_path / "poke.png").read_bytes().startswith(b"\x89PNG")
     for row in (-1, 10 ** 6):
         one_line(capsys, run("show", small / "checkpoint.npz", "--row", row), "row", str(row))
@@ -172,9 +174,12 @@ def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsy
 
 
 @needs_bullet
-def test_plan_writes_a_record_an_animation_and_the_population(small, tmp_path, capsys):
+@pytest.mark.parametrize("own_goal", [False, True])
+def test_plan_writes_a_record_an_animation_and_the_population(own_goal, small, tmp_path, capsys):
+    with control.random_task(1, 1) as task:
+        goal = ["--mark", *task.marks[0], "--goal", 32, 24] if own_goal else []
     assert run("plan", small / "checkpoint.npz", "--policy", "oracle", "--candidates", 8, "--iterations", 1, "--budget",
-               1, "--seed", 1, "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
+               1, "--seed", 1, *goal, "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
     out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
     assert "poke 1 to (" in out and "cm from the goals" in out
     assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
@@ -297,7 +302,8 @@ def test_module_and_installed_command_are_the_same_from_any_folder(tmp_path):
 
 
 def test_what_takes_long_to_import_waits_until_it_is_needed():
-    code = ("import sys, hind4sight_min.lab.cli; wrong = {'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules);"
+    code = ("import sys, hind4sight_min.lab.cli as _; "
+            "wrong = {'matplotlib', 'scipy.optimize', 'pybullet'} & set(sys.modules);"
             "import hind4sight_min.lab.figures; wrong |= {'matplotlib.pyplot'} & set(sys.modules);"
             "sys.exit(f'imported too early: {wrong}' if wrong else 0)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -126,7 +126,8 @@ def poke(squared, motion, objects=1, at_wall=False):
 
 def test_the_ratio_is_pooled_and_reported_apart_for_groups_of_pokes():
     pokes = [poke(1.0, 10.0), poke(4.0, 10.0, at_wall=True), poke(6.0, 20.0, objects=2), poke(0.0, 0.0, objects=0)]
-    found = summary(pokes, np.zeros((4, 3)), np.arange(4))
+    found = summary(pokes, np.array([[0.01, 0, 0], [0.02, 0, 0], [0.03, 0, 0], [0.2, 0, 0]]), np.arange(4))
+    assert found["inverse_target_cm"] == pytest.approx(2), "the last one moved nothing: who could name it?"
     expected = dict(flow_mse_ratio=11 / 40, single_flow_mse_ratio=5 / 20, multi_flow_mse_ratio=6 / 20,
                     wall_flow_mse_ratio=4 / 10, trimmed_flow_mse_ratio=5 / 20, single_pokes=2, multi_pokes=1,
                     wall_pokes=1, pokes=4, pokes_moved=3)

@@ -208,6 +208,10 @@ def test_settle_reports_what_still_falls_and_a_snapshot_brings_back_what_was():
         assert not arena.settle()
         arena.restore(state)
         np.testing.assert_array_equal(arena.poses(), before)
+    with make_arena(objects_min=2, objects_max=2, **FAST) as arena:
+        arena.new_scene()
+        put(arena, 0, 0, 6.0)
+        assert not arena.settle(), "the other one is at rest, which is not enough"
 
 
 def track_of(arena, poke, start):

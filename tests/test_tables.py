@@ -25,10 +25,12 @@ TINY_SCALE = Scale(train_pokes=7, test_pokes=7, steps=3, long_steps=4, seeds=(1,
 
 @pytest.fixture
 def small_world(monkeypatch):
-    """Seven pokes of a block in place of simulated ones, and networks of a few units."""
-    monkeypatch.setattr(tables, "_data", lambda folder: moved_blocks())
+    """Seven pokes of a block in place of simulated ones, and networks of a few units -> the folders asked for."""
+    asked = []
+    monkeypatch.setattr(tables, "_data", lambda folder: asked.append(folder.name) or moved_blocks())
     full = tables.recipe_of
     monkeypatch.setattr(tables, "recipe_of", lambda *given: replace(full(*given), sizes=TINY.sizes, batch=4))
+    return asked
 
 
 # --- which runs -------------------------------------------------------------------------------------------------
@@ -81,6 +83,7 @@ def test_a_cell_goes_on_where_it_was_and_is_run_once(tmp_path, small_world, monk
     cell = Cell("full", "clean", 1, long=True)
     whole = tables.run_cell(cell, tmp_path / "whole", TINY_SCALE)
     assert whole["train_seconds"] > 0 and "unseen_flow_mse_ratio" in whole
+    assert small_world == ["train", "test", "unseen"], "trained on the one, evaluated on the others"
     save, parts = runs.save_run, tmp_path / "parts" / "cells"
 
     def stop_at_two(path, run):
