@@ -44,7 +44,7 @@ held_out, truth = lesson.pokes("test")
 camera = train.camera
 recipe = training.Recipe(steps=200)
 if options.quick:
-    recipe = training.Recipe(steps=80, batch=8, warmup=15, learning_rate=3e-3)
+    recipe = training.Recipe(steps=60, batch=8, warmup=10, learning_rate=3e-3)
 shipped = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 
 # %% [markdown]
@@ -193,7 +193,7 @@ def snapshot(run):
     return run.step, prediction.masks.reshape(*shape, -1), flow.reshape(*shape, 2)
 
 
-EPOCH, FEW = len(train) // recipe.batch, recipe.steps // (10 if options.quick else 25)  # steps
+EPOCH, FEW = len(train) // recipe.batch, recipe.steps // (8 if options.quick else 25)  # steps
 run = training.start_run(recipe, train)
 log, snapshots, measurements = [], [snapshot(run)], [(0, *measure(run))]  # log: the terms of every step
 
@@ -323,7 +323,7 @@ options.out.mkdir(parents=True, exist_ok=True)
 animation = options.out / "08_emergence.gif"
 writer = PillowWriter(fps=4)
 with writer.saving(figure, animation, dpi=70):
-    for at, masks, flow in snapshots + snapshots[-1:] * 4:  # the last one stays for a while
+    for at, masks, flow in snapshots + snapshots[-1:] * (0 if options.quick else 4):  # the last one stays for a while
         for i, (left, right) in enumerate(shown):
             left.set_data(blend(parts.images[i], masks[i][..., 1:]))
             right.set_data(flow_to_rgb(flow[i], moved[i].max()))

@@ -41,7 +41,7 @@ from hind4sight_min.networks import predict
 options = lesson.begin("09_evaluation")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
-POKES = 40 if options.quick else 80
+POKES = 30 if options.quick else 80
 data, truth = (part[np.arange(POKES)] for part in lesson.pokes())
 run = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 errors = [evaluation.errors_of_poke(run, data, truth, row) for row in range(POKES)]  # a dict for each poke
@@ -186,13 +186,13 @@ lesson.keep(options, figure, "noise")
 # order of the pokes; the full model gets two.
 
 # %%
-STEPS, SEEDS = (70, (0,)) if options.quick else (150, (0, 1))
+STEPS, SEEDS = (50, (0,)) if options.quick else (150, (0, 1))
 NOISE = "clean"  # or "noisy": see the experiment below
 train, _ = lesson.pokes("train")
 small = {}
 for model, seeds in (("2d", (0,)), ("3d", (0,)), ("full", SEEDS)):
     for seed in seeds:
-        recipe = training.Recipe(steps=STEPS, batch=4, warmup=20, learning_rate=2e-3, seed=seed,
+        recipe = training.Recipe(steps=STEPS, batch=4, warmup=10, learning_rate=2e-3, seed=seed,
                                  weights=tables.MODELS[model][1])  # little time
         objective = tables.objective_of(tables.Cell(model, NOISE, seed))
         trained = training.train(train, training.start_run(recipe, train), objective)
