@@ -27,11 +27,10 @@ from hind4sight_min.sim.truth import load_truth
 
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
-from results import replaced  # noqa: E402
+from results import page_with  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 DOCS = Path(__file__).resolve().parent
-BEGIN, END = "<!-- norms: written by docs/understanding.py -->", "<!-- /norms -->"
 COLOURS = {"chamfer": "#0072B2", "distance_smoothness": "#56B4E9", "photometric": "#D55E00",
            "flow_smoothness": "#E69F00"}
 
@@ -191,7 +190,7 @@ def main():
     training.train(train, early)
     page = args.out / "understanding.md"
     table = norms_table({"after 100 steps": early, "shipped": shipped}, interactions)
-    write_text(page, replaced(page.read_text(), BEGIN, END, table))
+    write_text(page, page_with(page.read_text(), {"norms": table}))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
 """Every benchmark runs, for one round and with the smallest settings, and records finite figures."""
+import importlib.util
 import json
 import math
 import os
@@ -37,3 +38,13 @@ def test_a_benchmark_runs(name, tmp_path):
     figures = json.loads(path.read_text())
     assert not set(expected) - set(figures), "the README's table and docs/results.py ask for these"
     assert all(math.isfinite(value) and value > 0 for value in figures.values()), figures
+
+
+def test_all_eighty_planted_faults_still_fit_the_source():
+    spec = importlib.util.spec_from_file_location("planted_faults", ROOT / "benchmarks" / "planted_faults.py")
+    planted = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(planted)
+    assert len({fault.name for fault in planted.FAULTS}) == len(planted.FAULTS) == 80
+    for fault in planted.FAULTS:
+        planted.with_fault(fault)  # raises where its text is not there once, or no Python comes of it
+        assert all((ROOT / "tests" / f"test_{name}.py").exists() for name in fault.tests.split()), fault.name

@@ -218,6 +218,12 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
         control.closed_loop(task, run, "learned", SMALL, budget=5)
 
 
+@pytest.mark.parametrize("cost, now, made", [(0.1, 0.39, 0), (0.96, 1.0, 0), (0.94, 1.0, 1)])
+def test_the_loop_ends_at_the_goal_and_where_a_poke_hardly_helps(cost, now, made, task, run, pokes, monkeypatch):
+    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, None, cost, now))
+    assert len(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"]) == made
+
+
 def test_where_bullet_finds_the_finger_s_way_taken_the_next_start_is_used_or_the_poke_is_spent(task, run, pokes,
                                                                                                monkeypatch):
     asked = []
