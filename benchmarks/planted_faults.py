@@ -91,16 +91,15 @@ PLANTED = (
         ("masks start as movers", 'params["mask_b"] -= 1', 'params["mask_b"] += 1'),
         ("the finger meets what lies behind its start", "& (x > -0.16) & (depth > 0)", "& (depth > 0)"),
         ("motions turned back the wrong way", "np.swapaxes(axes, 1, 2))\n    return", "axes)\n    return"),
-        ("points that do not count shift a mask's centroid", "take(masks, (..., slice(1, None))) * valid[..., None]",
-         "take(masks, (..., slice(1, None)))"),
         ("T = R c - c + t", "centroids - turned + take", "turned - centroids + take"),
-        ("points that only fill a row up are moved", "anp.where(counts, found.points, looked)", "found.points"),
+        ("what only fills a row up moves", "masks = counts * masks + (1 - counts) * background", "masks = 1.0 * masks"),
         ("L_sim trains the encoder that compares",
          "encode({name: getval(value) for name, value in params.items()}, points)", "encode(params, points)"),
         ("the inverse model's two maps swapped", "take(logits, (..., 0)), take(logits, (..., 1))",
          "take(logits, (..., 1)), take(logits, (..., 0))")]),
 
     ("training.py", "training", [
+        ("L_sim counts what only fills a row up", "before.occupied[rows] & seen", "before.occupied[rows]"),
         ("the poke's part of the picture gives its target away", "(*most_changed(before, after),",
          "(*most_changed(crop(before, pokes, camera), crop(after, pokes, camera)),"),
         ("all images of a batch share their noise", "rng.standard_normal(before.images.shape, np.float32)",

@@ -23,7 +23,8 @@ def tensors(batch):
     rows, seen = look(before, batch.pokes)
     arrays = {**vars(before), **{f"next_{name}": value for name, value in vars(after).items()}}
     arrays["shared"], arrays["next_shared"] = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
-    arrays.update(rows=rows, seen=seen, next_rows=look(after, batch.pokes)[0], pokes=batch.pokes)
+    next_rows, next_seen = look(after, batch.pokes)
+    arrays.update(rows=rows, seen=seen, next_rows=next_rows, next_seen=next_seen, pokes=batch.pokes)
     arrays.update(zip(("changed", "next_changed", "change", "centres"), batch.evidence))
     arrays["start"], arrays["end"] = batch.cells.T
     return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
@@ -224,8 +225,9 @@ def photometric(images, next_images, flow, valid):
 def loss_terms(p, sizes, b, camera, nearest):
     """Batch means of all terms; training.loss_terms."""
     predicted, rows, next_rows = predict(p, sizes, b), at(b["rows"]), at(b["next_rows"])
-    embedding = state_embedding(p, predicted[rows], b["occupied"][rows])
-    next_embedding = state_embedding(p, b["next_points"][next_rows], b["next_occupied"][next_rows])
+    embedding = state_embedding(p, predicted[rows], b["occupied"][rows] & b["seen"])
+    next_embedding = state_embedding(p, b["next_points"][next_rows],
+                                     b["next_occupied"][next_rows] & b["next_seen"])
     start, end = inverse_model(p, b["changed"], b["next_changed"], b["change"], b["centres"])
     images, next_images = b["images"], b["next_images"]
     flow = (project(predicted, camera) - project(b["points"], camera)).view(*images.shape[:3], 2)

@@ -197,7 +197,9 @@ def forward_model(params, sizes, points, valid, pokes):
     # The background's logit is 0, a mover's bounded: a mask pushed to nothing would have no gradient to come back with.
     movers = MASK_BOUND * anp.tanh(layer(params, "mask", h, leaky=False) / MASK_BOUND)
     masks = softmax(anp.concatenate([np.zeros(movers.shape[:2] + (1,), points.dtype), movers], axis=2))  # (B, M, K)
-    rotations, translations = _motions(params, h, masks, context(h), local, valid)
+    counts, background = valid[..., None].astype(points.dtype), np.eye(sizes.masks, dtype=points.dtype)[0]
+    masks = counts * masks + (1 - counts) * background  # what does not count stays
+    rotations, translations = _motions(params, h, masks, context(h), local)
     moved = transform_layer(local, masks, rotations, translations)  # Eq. (1), in the poke's frame
     axes, _ = poke_axes(pokes.astype(points.dtype))
     predicted = points + anp.matmul(moved - local, np.swapaxes(axes, 1, 2))
@@ -215,14 +217,14 @@ def softmax(logits):
 MOTION_UNIT = np.array([0.005] * 3 + [0.1] * 3, np.float32)
 
 
-def _motions(params, h, masks, seen, local, valid):
+def _motions(params, h, masks, seen, local):
     """One rigid motion per mask, from the features pooled under it; the background's is the identity.
 
     -> rotations (B, K, 3, 3), translations (B, K, 3) m, in the poke's frame, from twists [translation, rotation],
     uncoupled as in SE3-Nets: R = exp(w). The network speaks of a turn about the mask's centroid c and a shift t:
     p' = R (p - c) + c + t, that is T = c - R c + t.
     """
-    moving = anp.swapaxes(take(masks, (..., slice(1, None))) * valid[..., None], 1, 2)  # (B, K-1, M)
+    moving = anp.swapaxes(take(masks, (..., slice(1, None))), 1, 2)  # (B, K-1, M)
     shares = moving / (anp.sum(moving, axis=2, keepdims=True) + np.float32(1e-3))  # finite where a mask covers nothing
     pooled, centroids = anp.matmul(shares, h), anp.matmul(shares, local)  # (B, K-1, C), (B, K-1, 3)
     batch, count = pooled.shape[:2]
@@ -243,12 +245,9 @@ def predict(params, sizes, scene, pokes):
     The forward model on the points that `scene.look` finds; all others are background that stays.
     """
     (rows, seen), points = look(scene, pokes), scene.points
-    looked, counts = points[at_rows(rows)], seen[..., None]
-    found = forward_model(params, sizes, looked, seen, pokes)
-    background = np.eye(sizes.masks, dtype=points.dtype)[0]
-    still = np.broadcast_to(background, points.shape[:2] + background.shape)
-    return Prediction(put_rows(points, rows, anp.where(counts, found.points, looked)),
-                      put_rows(still, rows, anp.where(counts, found.masks, background)),
+    found = forward_model(params, sizes, points[at_rows(rows)], seen, pokes)
+    still = np.broadcast_to(np.eye(sizes.masks, dtype=points.dtype)[0], points.shape[:2] + (sizes.masks,))
+    return Prediction(put_rows(points, rows, found.points), put_rows(still, rows, found.masks),
                       found.rotations, found.translations)
 
 

@@ -91,12 +91,13 @@ def crop(scene, pokes, camera):
     high = np.clip(np.ceil(pixels.max(axis=1)), 0, picture - 1).astype(int)
     columns, rows = (high - low).max(axis=0) + 1
     left, top = np.minimum(low, picture - [columns, rows]).T
-    pick = (np.arange(len(pokes))[:, None, None], (top[:, None] + np.arange(rows))[:, :, None],
-            (left[:, None] + np.arange(columns))[:, None, :])
-    shape = (len(pokes), camera.height, camera.width)
-    cut = {name: value.reshape(*shape, *value.shape[2:])[pick].reshape(len(pokes), -1, *value.shape[2:])
-           for name, value in vars(scene).items() if name != "images"}
-    return Scene(**cut, images=scene.images[pick])
+
+    def cut(pictures):  # (B, H, W, ...) -> (B, rows, columns, ...)
+        return np.stack([each[y:y + rows, x:x + columns] for each, x, y in zip(pictures, left, top)])
+    shape = len(pokes), camera.height, camera.width
+    flat = {name: cut(value.reshape(*shape, *value.shape[2:])).reshape(len(pokes), -1, *value.shape[2:])
+            for name, value in vars(scene).items() if name != "images"}
+    return Scene(**flat, images=cut(scene.images))
 
 
 # --- what changed: the evidence of a poke, for the inverse model --------------------------------------------------

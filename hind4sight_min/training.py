@@ -105,9 +105,10 @@ def loss_terms(params, sizes, batch, camera, wanted=WEIGHTS):
     if "inverse" in wanted:
         heatmaps = inverse_model(params, *batch.evidence)
         # Only where the poke can have changed something: elsewhere both embeddings have the same share.
-        rows, next_rows = (at_rows(look(scene, batch.pokes)[0]) for scene in (before, after))
-        embeddings = (state_embedding(params, take(prediction.points, rows), before.occupied[rows]),
-                      state_embedding(params, after.points[next_rows], after.occupied[next_rows]))
+        (rows, seen), (next_rows, next_seen) = (look(scene, batch.pokes) for scene in (before, after))
+        rows, next_rows = at_rows(rows), at_rows(next_rows)
+        embeddings = (state_embedding(params, take(prediction.points, rows), before.occupied[rows] & seen),
+                      state_embedding(params, after.points[next_rows], after.occupied[next_rows] & next_seen))
         terms["inverse"] = losses.inverse_loss(*heatmaps, *batch.cells.T, *embeddings)
     return {name: term for name, term in terms.items() if name in wanted}
 

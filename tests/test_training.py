@@ -74,8 +74,11 @@ def test_image_noise_lets_a_motion_begin():
 def test_every_term_gets_its_own_arguments():
     data, run = tiny_pokes(), random_run()
     data.depth_before[0, 5, 6] = data.depth_after[1, 6, 7] = 0
+    data.pokes[:4, 1] -= 0.2  # these end where no object stands
     batch, params = make_batch(data, TINY, RNG(0)), run.params
     before, after = batch.before, batch.after
+    rows, seen = look(before, batch.pokes)
+    assert (np.take_along_axis(before.occupied, rows, axis=1) & ~seen).any()  # what only fills a row up, L_sim leaves out
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     assert (valid != before.valid).any() and (valid != next_valid).any()
     predicted = networks.predict(params, SIZES, before, batch.pokes).points

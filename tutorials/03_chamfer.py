@@ -9,7 +9,7 @@ Equations:
 - Not in the paper, which points count: `losses.seen_in_both`; tests/test_eq2_chamfer.py
 - Sec. IV-B, depth noise: `lab.noise.add_depth_noise`; tests/test_noise.py
 
-Time: 4 s. Pictures: 03_maps.png, 03_gradient.png, 03_basin.png.
+Time: 3 s. Pictures: 03_maps.png, 03_gradient.png, 03_basin.png.
 
 Last lines to expect:
    angle of the summed pull to the true motion [degrees]: expected below 15, got 1.542

@@ -10,7 +10,7 @@ Equations:
 - Eq. (2) and (3) for comparison: `losses.chamfer_loss`, `losses.photometric_loss`; tests/test_eq2_chamfer.py,
   tests/test_eq3_photometric.py
 
-Time: 7 s. Pictures: 05_flows.png, 05_follow.png, 05_edges.png, 05_maps.png, 05_holes.png.
+Time: 5 s. Pictures: 05_flows.png, 05_follow.png, 05_edges.png, 05_maps.png, 05_holes.png.
 
 Last lines to expect:
    share of pokes in which the factor of L_ds is larger: expected above 0.7, got 0.85

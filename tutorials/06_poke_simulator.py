@@ -11,7 +11,7 @@ Equations:
 - Sec. IV-B, the data set: `sim.collection.collect_shard`; tests/test_sim_collection.py
 - Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`; tests/test_sim_truth.py
 
-Time: 6 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
+Time: 5 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
 
 Last lines to expect:
    median angle between an object's motion and the poke [degrees]: expected below 30, got 18.09

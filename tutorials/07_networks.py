@@ -15,7 +15,7 @@ Equations:
 - Sec. III-G, initialisation: `networks.init_parameters`; tests/test_networks.py
 - Eq. (6), the gradient of every term: `training.chunk_gradient`; tests/test_training.py
 
-Time: 7 s. Pictures: 07_what_if.png, 07_masks.png, 07_heatmaps.png, 07_gradients.png.
+Time: 6 s. Pictures: 07_what_if.png, 07_masks.png, 07_heatmaps.png, 07_gradients.png.
 
 Last lines to expect:
    gradient of the 3D terms of Eq. (6) against a finite difference, ratio: expected 1 within 0.001, got 1

@@ -10,7 +10,7 @@ Equations:
 - Sec. IV-C, the error on held-out pokes: `lab.evaluation.true_motion`, `lab.evaluation.matched_iou`;
   tests/test_evaluation.py
 
-Time: 35 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
+Time: 20 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
 
 Last lines to expect:
    held-out: IoU of the masks: expected above 0.4, got 0.6557

@@ -13,7 +13,7 @@ Equations:
 - Sec. IV-B, depth noise: `lab.noise.add_depth_noise`, `lab.noise.smooth_depth`; tests/test_noise.py
 - Sec. IV-F, the ablation: `lab.tables.MODELS`, `lab.tables.objective_of`; tests/test_tables.py
 
-Time: 35 s. Pictures: 09_errors.png, 09_noise.png, 09_ablation.png.
+Time: 20 s. Pictures: 09_errors.png, 09_noise.png, 09_ablation.png.
 
 Last lines to expect:
    full model: ratio: expected below 0.85, got 0.3364

@@ -10,7 +10,7 @@ Equations:
 - Sec. IV-G, cost in 2D and 3D: `planning.planning_cost`; tests/test_planning.py
 - Sec. IV-G, closed loop: `lab.control.closed_loop`, `lab.marks.follow`; tests/test_control.py, tests/test_marks.py
 
-Time: 5 s. Pictures: 10_population.png, 10_loop.png, 10_cost.png, 10_sequence.gif.
+Time: 4 s. Pictures: 10_population.png, 10_loop.png, 10_cost.png, 10_sequence.gif.
 
 Last lines to expect:
    distance left after the loop / at the start: expected below 0.35, got 0.0444
