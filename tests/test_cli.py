@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hind4sight_min import training
+from hind4sight_min import planning, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.lab import cli, control
@@ -198,6 +198,11 @@ def test_plan_refuses_in_one_line(small, arguments, words, tmp_path, capsys, mon
     monkeypatch.setenv("MPLBACKEND", "agg")
     one_line(capsys, run("plan", small / "checkpoint.npz", *arguments, "--out", tmp_path / "new"), *words)
     assert not (tmp_path / "new").exists()
+
+
+def test_plan_searches_as_planning_does_unless_told():
+    args = cli.build_parser().parse_args(["plan"])
+    assert planning.Search(**{name: getattr(args, name) for name in cli.SEARCH_OPTIONS}) == planning.Search()
 
 
 def test_clicks_are_pairs(monkeypatch):
