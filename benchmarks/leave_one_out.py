@@ -1,7 +1,7 @@
 """What each thing that is not in the paper brings: the model trained without it, one at a time.
 
     python benchmarks/leave_one_out.py TRAIN FRESH OUT [--steps 3000] [--seeds 1 2] [--only NAME ...]
-    python benchmarks/leave_one_out.py --table OUT
+    python benchmarks/leave_one_out.py --table OUT [--json FIGURES]
 
 TRAIN, FRESH: folders of `hind4sight collect` (for the table of docs/not-in-the-paper.md 24,000 pokes of seed 5 and
 1,000 of seed 900101). Every variant is a change of the source, made in a copy of the package, trained and evaluated in
@@ -17,6 +17,8 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from hind4sight_min.disk.files import write_json
 
 PACKAGE = Path(__file__).resolve().parent.parent / "hind4sight_min"
 
@@ -123,10 +125,13 @@ def main():
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
-    parser.add_argument("--table", type=Path, metavar="OUT")
+    parser.add_argument("--table", type=Path, metavar="OUT", help="train nothing; show what is finished")
+    parser.add_argument("--json")
     args = parser.parse_args()
     if args.table:
-        return print(table(args.table))
+        print(table(args.table))
+        runs = {path.stem: json.loads(path.read_text()) for path in sorted(args.table.glob("*.json"))}
+        return write_json(args.json, {"table": table(args.table), "runs": runs})
     if len(args.folders) != 3:
         parser.error("expected three folders: TRAIN FRESH OUT")
     train, fresh, out = (folder.resolve() for folder in args.folders)

@@ -212,7 +212,7 @@ def tests_in(folder, tests):
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIME_OUT)
     except subprocess.TimeoutExpired:
         return "the time-out"
-    failed = re.findall(r"^(?:FAILED|ERROR) (?:tests/)?(\S+)", done.stdout, re.MULTILINE)
+    failed = re.findall(r"^(?:FAILED|ERROR) (?:tests/)?(.+?)(?: - |$)", done.stdout, re.MULTILINE)
     return None if done.returncode == 0 else failed[0] if failed else done.stdout[-500:] + done.stderr[-500:]
 
 
@@ -243,9 +243,10 @@ def main():
     faults = [fault for fault in FAULTS if any(word in fault.name or word in fault.file for word in args.only)]
     with tempfile.TemporaryDirectory() as folder:
         copy_of_tree(Path(folder))
-        failed = tests_in(Path(folder), sorted({name for fault in faults for name in fault.tests.split()}))
-    if failed:
-        sys.exit(f"without any fault: {failed}")
+        for name in sorted({name for fault in faults for name in fault.tests.split()}):
+            failed = tests_in(Path(folder), [name])
+            if failed:
+                sys.exit(f"without any fault: {failed}")
     survivors, began = [], time.perf_counter()
     with ThreadPoolExecutor(args.jobs) as pool:
         for fault, caught in zip(faults, pool.map(try_fault, faults)):

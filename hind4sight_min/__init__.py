@@ -1,7 +1,7 @@
 """Hind4sight-Net in a few readable NumPy files: unsupervised dynamics models from pokes.
 
-The core, in the order to read it: geometry, ops, losses, files, interactions, scene, networks, training, planning.
-Beside it `sim/`, the poke simulator, and `lab/`, the experiments and the command line: the core imports neither.
+The core, in the order to read it: geometry, ops, losses, interactions, scene, networks, training, planning. Beside it
+`disk/`, files; `sim/`, the poke simulator; `lab/`, the experiments and the command line: the core imports none of them.
 """
 import ctypes
 import numbers

@@ -157,7 +157,7 @@ def transform_layer(points, masks, rotations, translations):
 
 
 def poke_axes(pokes):
-    """Pokes (B, 3) -> Q (B, 3, 3), o (B, 3): p_arena = Q p_poke + o, x along the poke, origin at its target."""
+    """Pokes (B, 3) -> axes Q (B, 3, 3), origins o (B, 3) m: p_arena = Q p_poke + o, x along it, o its target."""
     c, s, zero, one = np.cos(pokes[:, 2]), np.sin(pokes[:, 2]), 0 * pokes[:, 2], 0 * pokes[:, 2] + 1
     axes = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
     return axes, np.stack([pokes[:, 0], pokes[:, 1], zero], axis=-1)

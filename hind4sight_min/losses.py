@@ -1,8 +1,8 @@
 """Equations 2-6: one function per equation, in plain autograd.
 
 Shapes: B interactions, H, W the picture, N = H * W points, row by row, so a map (B, N) is a picture (B, H, W).
-Every loss returns (B,): the sum over pixels as printed in the paper, per interaction; training averages
-over the batch. `valid` (B, N) marks the pixels that count: the others neither attract nor cost anything. In
+Every term returns (B,), per interaction: the sum over pixels as printed in the paper (L_sim: a mean); `full_loss`
+averages over the batch. `valid` (B, N) marks the pixels that count: the others neither attract nor cost anything. In
 training these are the pixels with depth that both frames show (`seen_in_both`); flow is smooth wherever there is depth.
 """
 from functools import lru_cache
@@ -27,6 +27,7 @@ def seen_in_both(valid, next_valid, occupied, next_occupied):
     valid, next_valid: pixels with depth; occupied, next_occupied: pixels of objects; all (B, N) bool
     -> two (B, N) bool.
     """
+    # left out: table here where the other frame shows an object
     return valid & (occupied | ~next_occupied), next_valid & (next_occupied | ~occupied)
 
 
@@ -96,7 +97,7 @@ def edge_aware_smoothness(field, images, valid):
     """sum_xy |d field/dx| e^{-|dI/dx|} + |d field/dy| e^{-|dI/dy|}: the common form of Eq. (4) and (5).
 
     field (B, H, W, C); images (B, H, W, 3) on the same grid, in [0, 1]; valid (B, N) bool -> (B,), units of the
-    field. A step counts where both neighbours have depth.
+    field. A step counts where both neighbours are valid.
     """
     across, down = edge_weights(images)
     valid = np.reshape(valid, images.shape[:3])

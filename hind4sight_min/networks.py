@@ -1,9 +1,8 @@
 """The siamese point encoder, the forward model and the inverse model. Parameters are a dict of arrays.
 
-Every network is the same small perceptron applied to each point, plus *context*: pooled features of the whole cloud and
-a code of the heights around the target, handed back to every point. What runs on every point is narrow; what runs
-once per scene may be wide. Paper: Sec. III-A, III-E and Fig. 3, whose boxes docs/architecture.md names; the paper's
-forward model is that of SE3-Nets, ours is smaller.
+Each network is a small perceptron on each point. Forward and inverse model also hand *context*, pooled features of all
+their points, back to each, the forward model a code of heights around the target too. What runs on every point is
+narrow; what runs once per scene may be wide. Paper: Sec. III-A, III-E, Fig. 3, whose boxes docs/architecture.md names.
 """
 from dataclasses import dataclass
 
@@ -92,7 +91,7 @@ def height_map(local, valid):
 
 
 ABOVE = 0.005  # m; lower points are the table's
-FINGER = 0.014  # m; half the width of what the finger sweeps: its radius and half a pixel
+FINGER = 0.014  # m; half the width of what the finger of sim.arena.Settings sweeps: its radius and about half a pixel
 
 
 def first_met(local, valid):
@@ -145,7 +144,7 @@ def init_parameters(sizes, rng, dtype=np.float32):
         add(f"trunk_{i}", width, width, bias=False)  # its bias is the context's
         add(f"context_{i}", 5 * width, width, gain=1.0)
     add("mask", width, sizes.masks - 1, gain=0.01)
-    params["mask_b"] -= 1  # background first
+    params["mask_b"] -= 1  # background first: 0.57 of every point (K = 3), not all of it, for movers need a gradient
     add("motion_1", 6 * width + 3, head)
     add("motion_2", head, head)
     add("motion_3", head, 6, gain=0.0)  # identity first
@@ -163,7 +162,7 @@ def init_parameters(sizes, rng, dtype=np.float32):
 # --- the forward model ---------------------------------------------------------------------------------------
 
 def layer(params, name, x, leaky=True):
-    """The layer `name`: y = x W + b, or max(y, 0.1 y), a leaky ReLU.  (..., I) -> (..., O)."""
+    """The layer `name`: y = x W + b, with leaky=True max(y, LEAK y).  (..., I) -> (..., O)."""
     return dense(x, params[name + "_w"], params[name + "_b"], leaky=leaky)
 
 
@@ -179,7 +178,8 @@ def forward_model(params, sizes, points, valid, pokes):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
     points (B, M, 3) m arena, a set, those that `scene.look` found; valid (B, M) bool, which of them count; pokes
-    (B, 3), (m, m, rad) -> Prediction of these points. `predict` asks it.
+    (B, 3), (m, m, rad) -> Prediction of these points. The poke enters only as the frame that everything is seen in, x
+    along it and its target the origin: where the finger came down is not told, as in the paper's u_t.
     """
     local = poke_frame(points, pokes)
     pooling = pooling_weights(local, valid)
@@ -217,18 +217,18 @@ def softmax(logits):
 MOTION_UNIT = np.array([0.005] * 3 + [0.1] * 3, np.float32)
 
 
-def _motions(params, h, masks, seen, local):
+def _motions(params, h, masks, context, local):
     """One rigid motion per mask, from the features pooled under it; the background's is the identity.
 
-    -> rotations (B, K, 3, 3), translations (B, K, 3) m, in the poke's frame, from twists [translation, rotation],
-    uncoupled as in SE3-Nets: R = exp(w). The network speaks of a turn about the mask's centroid c and a shift t:
+    -> rotations (B, K, 3, 3), translations (B, K, 3) m, in the poke's frame. Translation and rotation are separate
+    outputs, as in SE3-Nets: R = exp(w). The network speaks of a turn about the mask's centroid c and a shift t:
     p' = R (p - c) + c + t, that is T = c - R c + t.
     """
     moving = anp.swapaxes(take(masks, (..., slice(1, None))), 1, 2)  # (B, K-1, M)
     shares = moving / (anp.sum(moving, axis=2, keepdims=True) + np.float32(1e-3))  # finite where a mask covers nothing
     pooled, centroids = anp.matmul(shares, h), anp.matmul(shares, local)  # (B, K-1, C), (B, K-1, 3)
     batch, count = pooled.shape[:2]
-    everywhere = anp.reshape(seen, (batch, 1, -1)) * np.ones((1, count, 1), local.dtype)
+    everywhere = anp.reshape(context, (batch, 1, -1)) * np.ones((1, count, 1), local.dtype)
     x = layer(params, "motion_1", anp.concatenate([pooled, everywhere, centroids / 0.1], axis=2))
     twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), leaky=False)  # (B, K-1, 6)
     turn = so3_exp(take(twist, (..., slice(3, None))))
@@ -259,8 +259,9 @@ STATE_GAIN = 3.0  # L_sim beside the cross entropies; of 1, 3, 10 and more: see 
 def state_embedding(params, points, occupied):
     """s_t, the sum of the encoder's features over the points of objects. Paper: Sec. III-E.
 
-    Of the predicted cloud it is s'_{t+1}, of the observed one s_{t+1}. The gradient of L_sim stops here: it goes to the
-    points, not to the encoder, which would end up saying nothing, for then all clouds are alike (docs/research-log.md).
+    Of the predicted cloud it is s'_{t+1}, of the observed one s_{t+1}. L_sim moves the predicted points, and through
+    them all of the forward model. Here, where it measures, its gradient stops: the encoder's weights are held fixed,
+    for free they would make L_sim small by saying nothing (docs/research-log.md).
     (B, N, 3) m arena, occupied (B, N) bool -> (B, E).
     """
     features = encode({name: getval(value) for name, value in params.items()}, points)
@@ -275,8 +276,8 @@ def inverse_model(params, before, after, weights, cells):
     the target would give it away); cells (cells, 2) m, the centres of the arena's grid
     -> start logits, end logits, each (B, cells); softmax makes them heat-maps.
 
-    Everything is said relative to the centre of change, so that a poke learnt in one corner of the arena is
-    known in all of them. What changed is pooled by how much it changed, steeply, gently and not at all.
+    All but the encoder's features is said relative to the centre of change, so that a poke learnt in one corner of the
+    arena helps in all of them. What changed is pooled by how much it changed, steeply, gently and not at all.
     """
     centre = np.sum(weights[..., None] * (before + after), axis=1) / 2
     centre[:, 2] = 0

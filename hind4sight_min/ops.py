@@ -2,7 +2,7 @@
 
 Each is an autograd primitive: a forward function in NumPy, SciPy or OpenCV and its VJP (vector-Jacobian
 product: the gradient g of a scalar with respect to the output in, that with respect to each input out).
-Everything else in the package is plain autograd. What each brings is in docs/speed.md.
+Everything else in the package is plain autograd. What the costly ones bring is in docs/speed.md.
 """
 import math
 
@@ -219,7 +219,10 @@ def at_rows(rows):
 
 @primitive
 def put_rows(clouds, rows, values):
-    """The clouds (B, N, D) with their points `rows` (B, M) int, of which none repeats, replaced by values (B, M, D)."""
+    """The clouds (B, N, D) with their points `rows` (B, M) int, of which none repeats, replaced by values (B, M, D).
+
+    Only `values` has a derivative.
+    """
     result = clouds.copy()
     result[at_rows(rows)] = values
     return result

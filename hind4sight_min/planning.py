@@ -55,7 +55,7 @@ class Search:
     """The planner's budget and cost. candidates, elites, iterations, horizon: J, K, CEM's rounds, H.
 
     pixel_weight: per px of the marked points' mean distance, as far as it exceeds SLACK. chamfer_weight: per cm of
-    the root of the scene's Chamfer distance (mean squared distance, both ways). A pixel is about a centimetre, so
+    the root of the scene's Chamfer distance (mean squared distance, both ways). At 64 x 48 a pixel is about 1 cm, so
     neither term drowns the other, far away or near; without the root one would. 0 leaves a term out.
     """
     candidates: int = 64
@@ -126,7 +126,7 @@ def first_start(starts):
 
 
 def draw_pokes(rng, count, view, settings, horizon=1):
-    """Sequences (count, H, 3) as the training pokes were drawn: somewhere on what stands in the arena, from anywhere.
+    """Sequences (count, H, 3) much as the training pokes were drawn: on what stands in the arena, from anywhere.
 
     Those whose first poke has no free start are drawn again. Raises NoPoke where there is hardly one that has.
     """
@@ -184,15 +184,15 @@ def planning_cost(clouds, view, goal, camera, search):
     """
     cost = np.zeros(len(clouds))
     if search.pixel_weight:
-        pixels = project(clouds[:, len(view.cloud) - view.marked:], camera)  # by the implicit optical flow
+        pixels = project(clouds[:, len(view.cloud) - view.marked:], camera)  # where optical flow takes them
         away = np.linalg.norm(pixels - goal.pixels, axis=2)
         cost += search.pixel_weight * np.maximum(away - SLACK, 0).mean(axis=1)
     if search.chamfer_weight:
         if goal.points is None:
             raise ValueError("chamfer_weight: without a goal picture only the pixels count; set it to 0")
         tree = cKDTree(goal.points)
-        for j, scene in enumerate(clouds[:, view.occupied]):
-            there, back = tree.query(scene)[0], cKDTree(scene, balanced_tree=False).query(goal.points)[0]
+        for j, cloud in enumerate(clouds[:, view.occupied]):
+            there, back = tree.query(cloud)[0], cKDTree(cloud, balanced_tree=False).query(goal.points)[0]
             cost[j] += search.chamfer_weight * 100 * np.sqrt(np.mean(there ** 2) + np.mean(back ** 2))
     return cost
 
@@ -238,7 +238,7 @@ def cem(cost, population, rng, search, on_iteration=None):
             on_iteration(iteration, population, costs, mean, deviation)
         population = (mean + deviation * rng.standard_normal(population.shape)).astype(np.float32)
         population[..., 2] = wrapped(population[..., 2])
-        population[0] = best  # the best ever is kept
+        population[0] = best  # so that refitting never loses it
     return best, lowest
 
 

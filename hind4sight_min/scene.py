@@ -17,8 +17,8 @@ class Scene:
     """B pictures, prepared by `scene_of`: N points each, row by row. Planning appends the points that the user marked.
 
     points (B, N, 3) float32 m, arena. valid (B, N) bool: has depth. occupied (B, N) bool: of an object, Sec. IV-A.
-    stands_out (B, N) bool: nearer than the empty arena, or next to a point that is: the rims of objects count.
-    images (B, H, W, 3) float32 in [0, 1], N = H W; None where planning has moved the points.
+    stands_out (B, N) bool: nearer than the empty arena by more than OCCUPIED, or within RIM of a point that is.
+    images (B, H, W, 3) float32 in [0, 1], N = H W but for marks; None where planning has moved the points.
     """
     points: np.ndarray
     valid: np.ndarray
@@ -63,8 +63,8 @@ def box_of(pokes):
 def look(scene, pokes):
     """Where the forward model looks: the points that stand out, near where the poke ends.
 
-    Not in the paper. All other points are background that stays; see docs/not-in-the-paper.md for the motion this
-    loses. pokes (B, 3) -> rows (B, M) int, in order, and which of them count, (B, M) bool: M is what the fullest of the
+    Not in the paper. All other points are background that stays; what motion this loses is in docs/extending.md.
+    pokes (B, 3) -> rows (B, M) int, in order, and which of them count, (B, M) bool: M is what the fullest of the
     B scenes needs, and the others' rows are filled up with points that do not count.
     """
     away = np.abs(scene.points[..., :2] - box_of(pokes)[:, None].astype(np.float32)) < REACH

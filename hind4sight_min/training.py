@@ -24,9 +24,9 @@ class Recipe:
 
     steps: of the optimiser, one of OPTIMISERS. batch: interactions per step. learning_rate: peak; linear warm-up over
     `warmup` steps, then a cosine to zero. weights: of the terms of Eq. (6); a missing one is 0. image_noise: SD of
-    noise added to the images I_t, in [0, 1]. A simulator's still things look the same twice to the last bit, and there
-    Eq. (3) has a kink: to move all of them a little costs more than the object gains, and a new network, whose masks
-    are everywhere, learns to move nothing. Less than a grey level rounds it off (I_{t+1}: warping would smooth it).
+    noise added to the images I_t, in [0, 1]. Without it still pixels match exactly, and there |I_t - I'_t| has a kink:
+    any motion costs more at once than the object gains, so a new network learns to move nothing. Noise below a grey
+    level rounds the kink off. It goes into I_t, because warping would blur it in I_{t+1}.
     """
     steps: int = 3000
     batch: int = 16
@@ -57,8 +57,9 @@ class Recipe:
 class Batch:
     """B interactions as the model and the losses want them.
 
-    before, after: Scenes, cropped to where the poke can move something. evidence: what `inverse_model` is asked about,
-    from the whole pictures. pokes (B, 3) float32. cells (B, 2) int: where the poke started and ended, on the grid.
+    before, after: Scenes, cropped to where the poke can move something. evidence: (before, after, weights, cells),
+    what `inverse_model` is asked about, from the whole pictures. pokes (B, 3) float32. cells (B, 2) int: where the poke
+    started and ended, on the grid.
     """
     before: Scene
     after: Scene
@@ -149,10 +150,10 @@ def muon(run, gradient, rate, beta=0.9):
     """Adam for vectors, orthogonalised momentum (Muon; K. Jordan et al., 2024) for matrices. Not in the paper.
 
     A few directions dominate the gradient of a layer's matrix; the others, in which it would have to move as well,
-    hardly get to. Orthogonalised, all have the same say, and a third of the steps do (docs/research-log.md). Times
+    hardly get to. Orthogonalised, all have the same say, and a third of the steps suffice (docs/research-log.md). Times
     sqrt(max(shape)), an entry moves by the rate, in the root mean square, as in Adam's first step.
     """
-    step = adam(run, gradient, rate, beta1=beta)
+    step = adam(run, gradient, rate, beta1=beta)  # for vectors; it also updates the momentum that matrices need
     ahead = unflatten(beta * run.first_moment + (1 - beta) * gradient, run.layout)  # Nesterov's momentum
     for name, block in unflatten(step, run.layout).items():  # views of `step`
         if block.ndim == 2:
@@ -249,7 +250,7 @@ def training_step(data, run, objective=unsupervised, map=map):
     if not np.isfinite(gradient).all():
         raise FloatingPointError(f"the gradient is not finite at step {run.step}")
     rate = learning_rate(recipe, run.step)
-    run.step += 1
+    run.step += 1  # before the optimiser, whose correction of the moments counts from 1
     run.vector = run.vector - OPTIMISERS[recipe.optimiser](run, gradient, rate)
     return {name: sum(each[name] for each in terms) for name in terms[0]}
 

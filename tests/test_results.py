@@ -92,6 +92,12 @@ def test_a_page_points_to_functions_and_files_that_exist(page):
         assert ((ROOT / page).parent / path).exists(), path
 
 
+def test_the_readme_s_python_finds_what_it_imports():
+    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
+    compile(code, "README.md", "exec")
+    exec("\n".join(line for line in code.splitlines() if line.startswith("from ")), {})
+
+
 @pytest.mark.parametrize("equation", range(1, 7))
 def test_every_equation_has_its_row_in_the_paper_map(equation):
     assert f"| Eq. {equation}," in README

@@ -1,5 +1,5 @@
-"""What the simulator knows of its pokes and the robot does not see: for evaluation, and for SE3-Nets, the supervised
-baseline. Nothing that trains or plans without labels imports this file.
+"""What the simulator knows of its pokes and the robot does not see. sim/collection.py writes it, lab/ reads it, to
+measure, to set goals and to supervise SE3-Nets; nothing in the core, which trains and plans, can (tests/test_house.py).
 """
 from dataclasses import dataclass
 from pathlib import Path
