@@ -105,7 +105,7 @@ for name, matrices in (("the gradient", ops.unflatten(gradient, shipped.layout))
 # Guess first: most of what is not the object is bare table. Which wins, for motions as small as that?
 
 # %%
-SHIFTS = np.array([-0.05, -0.02, -0.01, -0.005, 0, 0.002, 0.005, 0.01, 0.02, 0.05])  # px
+SHIFTS = np.array([-0.05, -0.02, -0.01, -0.005, -0.002, 0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05])  # px
 NOISES = (0.0, recipe.image_noise)
 some = train[:100]
 tails, tips = (project(np.column_stack([places, np.full(len(some), 0.02)]), camera)
@@ -127,14 +127,18 @@ for noise, values in zip(NOISES, change):
     print(f"2. Images with noise of SD {noise}: photometric loss is lowest for a shift of "
           f"{SHIFTS[values.argmin()]:.3f} px")
 
-figure, panel = plt.subplots(figsize=(6.5, 3.4), layout="constrained")
-for noise, values, colour, style in zip(NOISES, change, (PALETTE[6], PALETTE[5]), ("s:", "o-")):
-    panel.plot(SHIFTS, values, style, color=colour, label=f"noise of SD {noise} on $I_t$")
-panel.axhline(0, color="0.5", linewidth=1)
-panel.axvline(0, color="0.5", linewidth=1)
-panel.set(xlabel="everything moved along the poke by [px]", ylabel="change of the photometric loss")
-panel.legend(fontsize=9)
-panel.set_title("A kink at no motion holds everything in place; a little noise rounds it off", fontsize=11)
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
+for panel in axes:
+    for noise, values, colour, style in zip(NOISES, change, (PALETTE[6], PALETTE[5]), ("s:", "o-")):
+        panel.plot(SHIFTS, values, style, color=colour, label=f"noise of SD {noise} on $I_t$")
+    panel.axhline(0, color="0.5", linewidth=1)
+    panel.axvline(0, color="0.5", linewidth=1)
+    panel.set(xlabel="everything moved along the poke by [px]")
+axes[0].set(ylabel="change of the photometric loss")
+axes[0].legend(fontsize=9)
+axes[1].set(xlim=(-0.0055, 0.0055), ylim=(-0.02, 0.08))
+axes[1].set_title("the same, near no motion", fontsize=11)
+figure.suptitle("A kink at no motion holds everything in place; a little noise rounds it off", fontsize=11)
 lesson.keep(options, figure, "kink")
 
 # %% [markdown]
@@ -378,7 +382,7 @@ lesson.check("learning rate half-way / peak", training.learning_rate(recipe, mid
 lesson.check("without noise: least loss of any shift / that of none", float(change[0][SHIFTS != 0].min()), above=0.01)
 lesson.check("with noise: loss of the best shift forwards, less that of none", float(change[1][SHIFTS > 0].min()),
              below=-0.005)
-lesson.check("with noise: the same backwards", float(change[1][SHIFTS < 0].min()), above=0.005)
+lesson.check("with noise: the same backwards", float(change[1][SHIFTS < 0].min()), above=0.002)
 lesson.check("pokes seen in the first epoch", len(np.unique([training.rows_of_step(recipe, len(train), number)
                                                              for number in range(EPOCH)])), len(train), within=0)
 quiet = training.loss_terms(fresh.params, recipe.sizes, training.make_batch(some[:4], recipe, np.random.default_rng(0)),
