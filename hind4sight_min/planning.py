@@ -54,9 +54,9 @@ class Goal:
 class Search:
     """The planner's budget and cost. candidates, elites, iterations, horizon: J, K, CEM's rounds, H.
 
-    pixel_weight: per px of the marked points' mean distance, as far as it exceeds SLACK. chamfer_weight: per cm of
-    the root of the scene's Chamfer distance (mean squared distance, both ways). At 64 x 48 a pixel is about 1 cm, so
-    neither term drowns the other, far away or near; without the root one would. 0 leaves a term out.
+    pixel_weight: per cm on the table of the marked points' mean pixel distance, as far as it exceeds SLACK.
+    chamfer_weight: per cm of the root of the scene's Chamfer distance (mean squared distance, both ways): neither term
+    drowns the other, far away or near; without the root one would. 0 leaves a term out.
     """
     candidates: int = 64
     elites: int = 8
@@ -175,7 +175,7 @@ def moved_scene(view, clouds):
 
 # --- the cost ----------------------------------------------------------------------------------------------------
 
-SLACK = 1.5  # px; marks are followed no better than that, so nearer than this the Chamfer distance decides alone
+SLACK = 0.015  # m; marks are followed no better than that, so nearer than this the Chamfer distance decides alone
 
 
 def planning_cost(clouds, view, goal, camera, search):
@@ -185,8 +185,8 @@ def planning_cost(clouds, view, goal, camera, search):
     cost = np.zeros(len(clouds))
     if search.pixel_weight:
         pixels = project(clouds[:, len(view.cloud) - view.marked:], camera)  # where optical flow takes them
-        away = np.linalg.norm(pixels - goal.pixels, axis=2)
-        cost += search.pixel_weight * np.maximum(away - SLACK, 0).mean(axis=1)
+        away = np.linalg.norm(pixels - goal.pixels, axis=2) * camera.pixel_size  # m on the table, at any picture size
+        cost += search.pixel_weight * 100 * np.maximum(away - SLACK, 0).mean(axis=1)
     if search.chamfer_weight:
         if goal.points is None:
             raise ValueError("chamfer_weight: without a goal picture only the pixels count; set it to 0")

@@ -155,13 +155,13 @@ def test_the_cost_against_brute_force():
     rng, view = np.random.default_rng(8), island()
     clouds = view.cloud + rng.normal(0, 0.02, (3, 1, 3)).astype(np.float32)
     goal = Goal(project(np.array([[0.05, 0.02, 0.03]]), CAMERA), rng.uniform(0, 0.05, (15, 3)))
-    away = np.linalg.norm(project(clouds[:, -1], CAMERA) - goal.pixels, axis=1)
+    away = np.linalg.norm(project(clouds[:, -1], CAMERA) - goal.pixels, axis=1) * CAMERA.pixel_size  # m on the table
     assert (away > planning.SLACK).all()
     squared = np.sum((clouds[:, :, None] - goal.points) ** 2, axis=3)
     chamfer = squared.min(axis=2).mean(axis=1) + squared.min(axis=1).mean(axis=1)
     for pixel, shape in ((1.0, 0.0), (0.0, 1.0), (2.0, 3.0)):
         found = planning_cost(clouds, view, goal, CAMERA, Search(pixel_weight=pixel, chamfer_weight=shape))
-        np.testing.assert_allclose(found, pixel * (away - planning.SLACK) + shape * 100 * np.sqrt(chamfer), rtol=1e-5)
+        np.testing.assert_allclose(found, 100 * (pixel * (away - planning.SLACK) + shape * np.sqrt(chamfer)), rtol=1e-5)
     with pytest.raises(ValueError, match="without a goal picture"):
         planning_cost(clouds, view, Goal(goal.pixels, None), CAMERA, Search())
 
@@ -170,7 +170,7 @@ def test_the_cost_is_the_mean_over_the_marks_and_the_shape_that_of_the_objects()
     view = island(marks=[[0, 0, 0.03], [0.01, 0, 0.03]], table=[[0.2, 0.2, 0], [-0.2, 0.1, 0]])
     goal = Goal(project(view.cloud[-2:], CAMERA) + [[10, 0], [0, 4]], None)
     found = planning_cost(view.cloud[None], view, goal, CAMERA, Search(chamfer_weight=0.0))
-    assert found[0] == pytest.approx((10 + 4) / 2 - planning.SLACK, rel=1e-4)
+    assert found[0] == pytest.approx(100 * ((10 + 4) / 2 * CAMERA.pixel_size - planning.SLACK), rel=1e-4)
     there = Goal(project(view.cloud[-2:], CAMERA), view.cloud[2:])
     assert planning_cost(view.cloud[None], view, there, CAMERA, Search())[0] == 0
 

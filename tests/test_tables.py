@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_se3nets import moved_blocks
-from tiny import TINY
+from tiny import TINY, camera, tiny_pokes
 
 from hind4sight_min import training
 from hind4sight_min.disk import checkpoints
@@ -222,7 +222,8 @@ def test_the_outcome_of_a_run_by_hand():
 
 def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
-    checkpoints.save_run(tmp_path / "run.npz", training.start_run(TINY, moved_blocks().interactions))
+    data = tiny_pokes(count=2, cam=camera(64, 48, 77.0))  # tasks are in pictures of the checkpoint's size
+    checkpoints.save_run(tmp_path / "run.npz", training.start_run(TINY, data))
     asked = []
     monkeypatch.setattr(control, "closed_loop", lambda task, run, policy, search, budget, seed: asked.append(
         (policy, search, seed)) or record([0.1, len(asked) / 100, 0.05]))
@@ -233,7 +234,7 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
     assert [policy for policy, *_ in asked] == ["learned", "greedy", "learned"]
     assert (asked[0][1].chamfer_weight, asked[0][1].horizon, asked[2][1].horizon) == (0, 1, 2)
     assert len({tuple(np.random.default_rng(seed).random(3)) for *_, seed in asked}) == 3, "all tries are the same"
-    checkpoints.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), moved_blocks().interactions))
+    checkpoints.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), data))
     with pytest.raises(ValueError, match="made with another"):
         run_scene("pixels", 1, 0)
 

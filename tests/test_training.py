@@ -286,7 +286,7 @@ def test_the_gradient_of_a_batch_is_that_of_its_chunks_and_a_map_may_spread_them
     assert [len(call[4]) for call in calls] == [3, 3, 1]
     difference = np.linalg.norm(chunks.first_moment - whole.first_moment)
     assert difference < 5e-3 * np.linalg.norm(whole.first_moment)  # rounding decides on which side of a kink it is
-    for name in set(WEIGHTS) - {"photometric"}:  # its value, not its gradient, depends on how much a crop holds
+    for name in set(parts) - {"photometric"}:  # its value, not its gradient, depends on how much a crop holds
         assert parts[name] == pytest.approx(terms[name], rel=1e-3, abs=1e-5), name
 
 

@@ -72,8 +72,8 @@ print(f"1. A cloud of {len(view.cloud)} points, {view.occupied.sum()} of them on
 #
 # Let the model carry the cloud along under a poke. The cost has two terms. In 2D: how far is the marked point,
 # projected into the picture, from its goal pixel? In 3D: the Chamfer distance, Eq. (2), of everything that stands in
-# the arena to what stands there in the goal picture; we take its root, so that it is a length. Pixels nearer than
-# `planning.SLACK` count as reached.
+# the arena to what stands there in the goal picture; we take its root, so that it is a length. A pixel counts for as
+# many centimetres as it is wide on the table, and what is nearer than `planning.SLACK` counts as reached.
 #
 # **Predict before you run:** hold the target of the poke on the object and turn the direction of the poke once
 # around. How many valleys will the cost have, and will both terms have them at the same place?
@@ -92,7 +92,7 @@ def rollout(sequences):
 
 clouds, starts = rollout(pokes)
 terms = {name: planning.planning_cost(clouds[:, 0], view, goal, camera, planning.Search(**weights))
-         for name, weights in (("pixel distance, px", {"chamfer_weight": 0.0}),
+         for name, weights in (("pixel distance, cm", {"chamfer_weight": 0.0}),
                                ("root of the Chamfer distance, cm", {"pixel_weight": 0.0}))}
 possible = np.isfinite(starts).all(axis=(1, 2))
 print(f"2. Of {len(angles)} directions {possible.sum()} leave room for the finger; lowest at "
@@ -186,8 +186,8 @@ by_hand = 100 * np.sqrt(squared.min(axis=1).mean() + squared.min(axis=0).mean())
 lesson.check("Chamfer term against brute force [cm]", float(terms["root of the Chamfer distance, cm"][0]),
              float(by_hand), within=1e-3)
 away = np.linalg.norm(project(clouds[0, 0, -view.marked:], camera) - goal.pixels, axis=1)
-pixel = float(np.maximum(away - planning.SLACK, 0).mean())
-lesson.check("pixel term against the projection by hand [px]", float(terms["pixel distance, px"][0]), pixel,
+pixel = float(100 * np.maximum(away * camera.pixel_size - planning.SLACK, 0).mean())
+lesson.check("pixel term against the projection by hand [cm]", float(terms["pixel distance, cm"][0]), pixel,
              within=1e-3)
 whole = float(planning.planning_cost(clouds[:1, 0], view, goal, camera, planning.Search())[0])
 lesson.check("both terms together", whole, pixel + by_hand, within=1e-3)

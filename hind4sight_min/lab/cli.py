@@ -197,7 +197,7 @@ def run_plan(args):
     if own:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search = planning.Search(**options)
-    with control.random_task(args.seed, args.objects, args.obstacle) as task:
+    with control.random_task(args.seed, args.objects, args.obstacle, control.settings_for(run)) as task:
         training.check_camera(run, task.arena.camera)
         if own:
             marks, goals = click(task.arena.observe()[0]) if args.click else (args.mark, args.goal)

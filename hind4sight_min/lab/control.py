@@ -6,7 +6,7 @@ down, Bullet is asked whether its way is free (`carry_out`). The first start of 
 is nowhere free, the poke is spent.
 """
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,6 +35,11 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
 
 # --- tasks --------------------------------------------------------------------------------------------------------
+
+def settings_for(run):
+    """SETTINGS of the test scenes, in pictures of the size that a run was trained with."""
+    return replace(SETTINGS, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
+
 
 @dataclass
 class Task:

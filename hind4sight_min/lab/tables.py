@@ -298,12 +298,12 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
     run, search = checkpoints.load_run(checkpoint), planning.Search(**changes)
 
     def compute():
-        with control.random_task(seed, max(movers, 1), obstacle=movers == 0) as task:
+        with control.random_task(seed, max(movers, 1), movers == 0, control.settings_for(run)) as task:
             return outcome(control.closed_loop(task, run, policy, search, POKES, seed=[seed, attempt]))
 
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
-        "settings": asdict(control.SETTINGS)}), compute)
+        "settings": asdict(control.settings_for(run))}), compute)
 
 
 def outcome(record):
