@@ -102,7 +102,9 @@ def test_an_object_that_turned_is_scored_point_by_point(oracle):
     points = unproject(data.depth_before[0], data.camera)[truth.labels[0] == 1]
     lengths = np.linalg.norm(points @ Rotation.from_euler("z", 0.5).as_matrix().T - points, axis=1)
     assert np.ptp(lengths) > 0.001
-    assert evaluate(None, data, truth)["flow_epe_cm"] == pytest.approx(100 * lengths.mean(), rel=1e-4)
+    found, root = evaluate(None, data, truth), np.sqrt(np.mean(lengths ** 2))
+    for name, value in (("flow_epe_cm", lengths.mean()), ("flow_rmse_cm", root), ("no_motion_rmse_cm", root)):
+        assert found[name] == pytest.approx(100 * value, rel=1e-4), name
 
 
 def test_errors_of_the_inverse_model_against_cell_centres(oracle):

@@ -63,11 +63,13 @@ def test_a_cloud_that_moved_is_looked_at_where_it_is_now():
     np.testing.assert_array_equal(moved[0][view.occupied], away[0][view.occupied])
 
 
-def test_empty_scenes_are_refused():
+def test_a_goal_is_where_objects_stand_and_empty_scenes_are_refused():
     scene, _ = scenes_of(tiny_pokes()[[0]])
     empty = replace(scene, occupied=np.zeros_like(scene.occupied))
     with pytest.raises(planning.NoPoke, match="scene: no object"):
         planning.view_of(empty, np.zeros((0, 3), np.float32))
+    goal = planning.goal_of([(3, 3)], scene)
+    np.testing.assert_array_equal(goal.points, scene.points[scene.occupied], err_msg="the table is no part of a goal")
     with pytest.raises(ValueError, match="goal scene: no object"):
         planning.goal_of([(3, 3)], empty)
 
@@ -78,6 +80,7 @@ def test_possible_starts_against_a_loop():
     rng = np.random.default_rng(5)
     grid = rng.random((60, 20, 20)) < 0.04
     pokes = np.column_stack([rng.uniform(-0.26, 0.26, (60, 2)), rng.uniform(-np.pi, np.pi, 60)])
+    pokes[:6, 0], pokes[:6, 2], grid[:6, :, 19] = 0.251, 0.1, True  # next to an object, but on a wall
     found, possible_ones, at_rim = possible_starts(pokes, grid, SETTINGS, lengths=3), 0, 0
     for j, (x, y, angle) in enumerate(pokes):
         def near(px, py):
