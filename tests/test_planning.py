@@ -149,7 +149,7 @@ def test_room_for_the_finger_is_sought_where_things_are_by_then():
     view = island()
     sequences = np.float32([[[0, 0, 0], [0.12, 0, 2.0]], [[0, 0, 0], [0, 0, 2.0]]])
     _, starts = roll(lambda clouds, pokes: clouds + np.float32([0.12, 0, 0]), view, sequences, SETTINGS)
-    np.testing.assert_array_equal(np.isfinite(starts[..., 0]), [[True, True], [True, False]], err_msg="the first scene?")
+    np.testing.assert_array_equal(np.isfinite(starts[..., 0]), [[True, True], [True, False]], err_msg="first scene?")
 
 
 # --- the cost -----------------------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ def test_every_term_gets_its_own_arguments():
     batch, params = make_batch(data, TINY, RNG(0)), run.params
     before, after = batch.before, batch.after
     rows, seen = look(before, batch.pokes)
-    assert (np.take_along_axis(before.occupied, rows, axis=1) & ~seen).any()  # what only fills a row up, L_sim leaves out
+    assert (np.take_along_axis(before.occupied, rows, axis=1) & ~seen).any()  # L_sim leaves out what fills a row up
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     assert (valid != before.valid).any() and (valid != next_valid).any()
     predicted = networks.predict(params, SIZES, before, batch.pokes).points
