@@ -213,7 +213,7 @@ def gather():
         if figures and name == "reproduce":
             figures = {**figures, **claims(figures)}
         if figures and figure in figures:
-            found[headline] = figures[figure]
+            found[headline] = float(figures[figure])
     return found
 
 
