@@ -9,7 +9,7 @@ pytest.importorskip("pybullet")
 from test_planning import CAMERA, island
 from tiny import SETTINGS
 
-from hind4sight_min import planning, training
+from hind4sight_min import planning
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import project, unproject
 from hind4sight_min.lab import control
