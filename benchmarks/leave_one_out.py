@@ -38,17 +38,12 @@ VARIANTS = {
     "no image noise": ([], {"image_noise": 0.0}, 0.0),
     "no height map": ([("networks.py", "return (total / (count + 0.2) / 0.03)", "return (0 * total)")], {}, 0.0),
     "no pooling where the finger first meets something": (
-        [("networks.py", "return met * central * np.exp", "return 0 * np.exp")], {}, 0.0),
-    "no pooling around the target and along the path": (
-        [("networks.py", "np.stack([near, path, first_met(local, valid)]",
-          "np.stack([0 * near, 0 * path, first_met(local, valid)]")], {}, 0.0),
+        [("networks.py", "weights = met * central", "weights = 0 * central")], {}, 0.0),
     "looks at all points of the box": ([("scene.py", "scene.valid & scene.stands_out & away", "scene.valid & away")],
                                        {}, 0.0),
     "mask logits unbounded": ([("networks.py", "MASK_BOUND = 6.0", "MASK_BOUND = 1e3")], {}, 0.0),
     "motions in units of 5 cm and 1 rad": (
         [("networks.py", "np.array([0.005] * 3 + [0.1] * 3", "np.array([0.05] * 3 + [1.0] * 3")], {}, 0.0),
-    "motions about the poke's target, not the mask's centroid": (
-        [("networks.py", "shift = centroids - turned + take", "shift = take")], {}, 0.0),
     "gradient of L_sim to the encoder too": (
         [("networks.py", "encode({name: getval(value) for name, value in params.items()}, points)",
           "encode(params, points)")], {}, 0.0),

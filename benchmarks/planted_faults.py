@@ -91,7 +91,7 @@ PLANTED = (
         ("masks start as movers", 'params["mask_b"] -= 1', 'params["mask_b"] += 1'),
         ("the finger meets what lies behind its start", "& (x > -0.16) & (depth > 0)", "& (depth > 0)"),
         ("motions turned back the wrong way", "np.swapaxes(axes, 1, 2))\n    return", "axes)\n    return"),
-        ("T = R c - c + t", "centroids - turned + take", "turned - centroids + take"),
+        ("the finger is flat in front", "FINGER * central - x", "FINGER - x"),
         ("what only fills a row up moves", "masks = counts * masks + (1 - counts) * background", "masks = 1.0 * masks"),
         ("L_sim trains the encoder that compares",
          "encode({name: getval(value) for name, value in params.items()}, points)", "encode(params, points)"),

@@ -68,15 +68,8 @@ def first_met(local, valid):
     depth = networks.FINGER * central - x
     met = valid & (z > networks.ABOVE) & (central > 0) & (x > -0.16) & (depth > 0)
     depth = depth * met
-    return met * central * torch.exp((depth - depth.amax(dim=1, keepdim=True)) / 0.004)
-
-
-def pooling_weights(local, valid):
-    x, y, z = local.unbind(-1)
-    near = torch.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
-    path = torch.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
-    weights = torch.stack([near, path, first_met(local, valid)], dim=1) * (valid & (z > networks.ABOVE))[:, None]
-    return weights / (weights.sum(dim=2, keepdim=True) + 1e-6)
+    weights = met * central * torch.exp((depth - depth.amax(dim=1, keepdim=True)) / 0.004)
+    return weights / (weights.sum(dim=1, keepdim=True) + 1e-6)
 
 
 def max_over_points(x, valid):
@@ -111,20 +104,21 @@ def so3_exp(w):
 
 
 def forward_model(p, sizes, points, valid, pokes):
-    """-> predicted points; networks.forward_model."""
+    """-> predicted points, masks (B, M, K); networks.forward_model."""
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
-    pooling = pooling_weights(local, valid)
+    met = first_met(local, valid)[:, None]
     shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
 
     def context(h):
-        return torch.cat([max_over_points(h, valid), (pooling @ h).flatten(1), shape], dim=1)
+        return torch.cat([max_over_points(h, valid), (met @ h)[:, 0], shape], dim=1)
 
     h = activation(linear(p, "trunk_0", torch.cat([poke_features(local), encode(p, points)], dim=2)))
     for i in range(1, sizes.rounds + 1):
         h = h + activation(h @ p[f"trunk_{i}_w"] + linear(p, f"context_{i}", context(h))[:, None])
     movers = networks.MASK_BOUND * torch.tanh(linear(p, "mask", h) / networks.MASK_BOUND)
-    masks = torch.softmax(F.pad(movers, (1, 0)), dim=2)[..., 1:].transpose(1, 2)  # the movers'
+    every = torch.softmax(F.pad(movers, (1, 0)), dim=2)
+    masks = every[..., 1:].transpose(1, 2)  # the movers'
 
     moving = masks * valid[:, None]
     share = moving / (moving.sum(dim=2, keepdim=True) + 1e-3)
@@ -132,10 +126,8 @@ def forward_model(p, sizes, points, valid, pokes):
     everywhere = context(h)[:, None].expand(-1, pooled.shape[1], -1)
     x = activation(linear(p, "motion_1", torch.cat([pooled, everywhere, centroids / 0.1], dim=2)))
     twist = torch.from_numpy(networks.MOTION_UNIT) * linear(p, "motion_3", activation(linear(p, "motion_2", x)))
-    turn = so3_exp(twist[..., 3:])
-    shift = centroids - (turn @ centroids[..., None])[..., 0] + twist[..., :3]
-    moved = local[:, None] @ turn.transpose(2, 3) + shift[:, :, None]
-    return points + (masks[..., None] * (moved - local[:, None])).sum(dim=1) @ axes.transpose(1, 2)
+    moved = local[:, None] @ so3_exp(twist[..., 3:]).transpose(2, 3) + twist[:, :, None, :3]
+    return points + (masks[..., None] * (moved - local[:, None])).sum(dim=1) @ axes.transpose(1, 2), every
 
 
 def at(rows):
@@ -143,11 +135,11 @@ def at(rows):
 
 
 def predict(p, sizes, b):
-    """-> all predicted points; networks.predict."""
+    """-> all predicted points, and the masks of those looked at; networks.predict."""
     rows = at(b["rows"])
     points = b["points"][rows]
-    found = forward_model(p, sizes, points, b["seen"], b["pokes"])
-    return b["points"].index_put(rows, torch.where(b["seen"][..., None], found, points))
+    found, masks = forward_model(p, sizes, points, b["seen"], b["pokes"])
+    return b["points"].index_put(rows, torch.where(b["seen"][..., None], found, points)), masks
 
 
 def inverse_model(p, before, after, weights, cells):
@@ -224,7 +216,7 @@ def photometric(images, next_images, flow, valid):
 
 def loss_terms(p, sizes, b, camera, nearest):
     """Batch means of all terms; training.loss_terms."""
-    predicted, rows, next_rows = predict(p, sizes, b), at(b["rows"]), at(b["next_rows"])
+    (predicted, masks), rows, next_rows = predict(p, sizes, b), at(b["rows"]), at(b["next_rows"])
     embedding = state_embedding(p, predicted[rows], b["occupied"][rows] & b["seen"])
     next_embedding = state_embedding(p, b["next_points"][next_rows],
                                      b["next_occupied"][next_rows] & b["next_seen"])
@@ -242,6 +234,7 @@ def loss_terms(p, sizes, b, camera, nearest):
         "flow_smoothness": smoothness(flow, images, b["valid"]),
         "inverse": F.cross_entropy(start, b["start"], reduction="none")
         + F.cross_entropy(end, b["end"], reduction="none") + (embedding - next_embedding).abs().mean(dim=1),
+        "binary_masks": (masks[..., 0] * (1 - masks[..., 0]) * b["seen"]).sum(dim=1),
     }
     return {name: value.mean() for name, value in terms.items()}
 

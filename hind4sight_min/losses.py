@@ -129,6 +129,18 @@ def distance_smoothness_loss(map_predicted, map_observed, images, next_images, v
             + edge_aware_smoothness(anp.reshape(map_predicted, grid), images, valid))  # Eq. (5)
 
 
+# --- masks ------------------------------------------------------------------------------------------------
+
+def binary_mask_loss(masks):
+    """sum_xy m^0 (1 - m^0): a point is to belong to the background or to move, not to do both. Not in the paper.
+
+    Half a mover's mask with twice its motion is the same flow, so without this term what moves little, and by the
+    larger mask is background, stays it. masks (B, N, K), summing to 1 over K -> (B,).
+    """
+    background = take(masks, (..., 0))
+    return anp.sum(background * (1 - background), axis=1)
+
+
 # --- the inverse model -----------------------------------------------------------------------------------
 
 def heatmap_cross_entropy(logits, cells):

@@ -95,8 +95,8 @@ FINGER = 0.014  # m; half the width of what the finger of sim.arena.Settings swe
 
 
 def first_met(local, valid):
-    """Where the finger first meets something on its way to the target: weights (B, N) in [0, 1], 0 where it meets
-    nothing. Not in the paper: a perceptron learns it slowly.
+    """Where the finger first meets something on its way to the target: weights (B, N) that sum to 1, or to 0 where it
+    meets nothing. Not in the paper: a perceptron learns it slowly.
 
     A disc of radius FINGER that ends in the origin pushes a point (x, y) of its way by d = sqrt(FINGER^2 - y^2) - x;
     the deepest one is met first. local (B, N, 3) m, poke frame; valid (B, N) bool.
@@ -106,18 +106,8 @@ def first_met(local, valid):
     depth = FINGER * central - x
     met = valid & (z > ABOVE) & (central > 0) & (x > -0.16) & (depth > 0)  # it comes down at most 14 cm before
     deepest = (depth * met).max(axis=1, keepdims=True)
-    return met * central * np.exp((depth * met - deepest) / 0.004)
-
-
-def pooling_weights(local, valid):
-    """Where the context looks: (B, 3, N), rows sum to 1. Around the target, along the finger's path, and where it first
-    meets something. Points on the table's surface are left out: they say nothing about the objects there.
-    """
-    x, y, z = local[..., 0], local[..., 1], local[..., 2]
-    near = np.exp(-(x ** 2 + y ** 2) / (2 * 0.04 ** 2))
-    path = np.exp(-y ** 2 / (2 * 0.015 ** 2)) * ((x > -0.15) & (x < 0.02))
-    weights = np.stack([near, path, first_met(local, valid)], axis=1) * (valid & (z > ABOVE))[:, None]
-    return (weights / (weights.sum(axis=2, keepdims=True) + 1e-6)).astype(local.dtype)
+    weights = met * central * np.exp((depth * met - deepest) / 0.004)
+    return (weights / (weights.sum(axis=1, keepdims=True) + 1e-6)).astype(local.dtype)
 
 
 # --- parameters --------------------------------------------------------------------------------------------
@@ -142,10 +132,10 @@ def init_parameters(sizes, rng, dtype=np.float32):
     add("trunk_0", 20 + embedding, width)
     for i in range(1, sizes.rounds + 1):
         add(f"trunk_{i}", width, width, bias=False)  # its bias is the context's
-        add(f"context_{i}", 5 * width, width, gain=1.0)
+        add(f"context_{i}", 3 * width, width, gain=1.0)
     add("mask", width, sizes.masks - 1, gain=0.01)
     params["mask_b"] -= 1  # background first: 0.57 of every point (K = 3), not all of it, for movers need a gradient
-    add("motion_1", 6 * width + 3, head)
+    add("motion_1", 4 * width + 3, head)
     add("motion_2", head, head)
     add("motion_3", head, 6, gain=0.0)  # identity first
     add("change_1", 2 * 20 + 2 * embedding + 1, inverse)
@@ -182,12 +172,11 @@ def forward_model(params, sizes, points, valid, pokes):
     along it and its target the origin: where the finger came down is not told, as in the paper's u_t.
     """
     local = poke_frame(points, pokes)
-    pooling = pooling_weights(local, valid)
+    met = first_met(local, valid)[:, None]
     shape = layer(params, "shape_2", layer(params, "shape_1", height_map(local, valid)))  # (B, C)
 
-    def context(h):  # (B, M, C) -> (B, 5 C)
-        pooled = anp.reshape(anp.matmul(pooling, h), (len(pokes), -1))
-        return anp.concatenate([max_over_points(h, valid), pooled, shape], axis=1)
+    def context(h):  # (B, M, C) -> (B, 3 C)
+        return anp.concatenate([max_over_points(h, valid), anp.matmul(met, h)[:, 0], shape], axis=1)
 
     h = layer(params, "trunk_0", anp.concatenate([poke_features(local), encode(params, points)], axis=2))
     for i in range(1, sizes.rounds + 1):
@@ -221,8 +210,7 @@ def _motions(params, h, masks, context, local):
     """One rigid motion per mask, from the features pooled under it; the background's is the identity.
 
     -> rotations (B, K, 3, 3), translations (B, K, 3) m, in the poke's frame. Translation and rotation are separate
-    outputs, as in SE3-Nets: R = exp(w). The network speaks of a turn about the mask's centroid c and a shift t:
-    p' = R (p - c) + c + t, that is T = c - R c + t.
+    outputs, as in SE3-Nets: R = exp(w), about the poke's target, and T.
     """
     moving = anp.swapaxes(take(masks, (..., slice(1, None))), 1, 2)  # (B, K-1, M)
     shares = moving / (anp.sum(moving, axis=2, keepdims=True) + np.float32(1e-3))  # finite where a mask covers nothing
@@ -231,9 +219,7 @@ def _motions(params, h, masks, context, local):
     everywhere = anp.reshape(context, (batch, 1, -1)) * np.ones((1, count, 1), local.dtype)
     x = layer(params, "motion_1", anp.concatenate([pooled, everywhere, centroids / 0.1], axis=2))
     twist = MOTION_UNIT * layer(params, "motion_3", layer(params, "motion_2", x), leaky=False)  # (B, K-1, 6)
-    turn = so3_exp(take(twist, (..., slice(3, None))))
-    turned = anp.reshape(anp.matmul(turn, anp.reshape(centroids, (batch, count, 3, 1))), (batch, count, 3))
-    shift = centroids - turned + take(twist, (..., slice(0, 3)))
+    turn, shift = so3_exp(take(twist, (..., slice(3, None)))), take(twist, (..., slice(0, 3)))
     identity = np.broadcast_to(np.eye(3, dtype=local.dtype), (batch, 1, 3, 3))
     return (anp.concatenate([identity, turn], axis=1),
             anp.concatenate([np.zeros((batch, 1, 3), local.dtype), shift], axis=1))

@@ -15,7 +15,8 @@ from .scene import Scene, crop, look, most_changed, scene_of
 
 # From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
 # See docs/research-log.md.
-WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0}
+WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
+           "binary_masks": 0.3}
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,8 @@ def loss_terms(params, sizes, batch, camera, wanted=WEIGHTS):
         terms["photometric"] = losses.photometric_loss(before.images, after.images, flow, valid)
     if "flow_smoothness" in wanted:
         terms["flow_smoothness"] = losses.flow_smoothness_loss(flow, before.images, before.valid)
+    if "binary_masks" in wanted:
+        terms["binary_masks"] = losses.binary_mask_loss(prediction.masks)
     if "inverse" in wanted:
         heatmaps = inverse_model(params, *batch.evidence)
         # Only where the poke can have changed something: elsewhere both embeddings have the same share.

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from autograd import grad
-from helpers import assert_close, assert_value
+from helpers import assert_close, assert_float32, assert_gradient, assert_value
 
 pytestmark = pytest.mark.eq6
 
@@ -48,6 +48,18 @@ def test_float32_stays_float32():
     weights = dict.fromkeys(NAMES, 0.3)
     assert full_loss(terms, weights).dtype == np.float32
     assert all(gradient.dtype == np.float32 for gradient in grad(full_loss)(terms, weights).values())
+
+
+# --- not in the paper ---------------------------------------------------------------------------------------------
+
+def test_a_point_between_background_and_motion_costs_by_hand():
+    from hind4sight_min.losses import binary_mask_loss
+    masks = np.array([[[1.0, 0, 0], [0, 1, 0]], [[0.5, 0.5, 0], [0.6, 0.2, 0.2]]])
+    assert_value(binary_mask_loss(masks), [0, 0.25 + 0.24], {
+        "every mask, not the background's alone": [0, 0.5 + 0.24 + 0.16 + 0.16], "the mean over points": [0, 0.245]})
+    softer = np.random.default_rng(0).dirichlet(np.ones(3), (2, 5))
+    assert_gradient(binary_mask_loss, 0, softer)
+    assert_float32(binary_mask_loss, 0, softer)
 
 
 # --- the weights --------------------------------------------------------------------------------------------------

@@ -81,7 +81,8 @@ def test_every_term_gets_its_own_arguments():
     assert (np.take_along_axis(before.occupied, rows, axis=1) & ~seen).any()  # L_sim leaves out what fills a row up
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     assert (valid != before.valid).any() and (valid != next_valid).any()
-    predicted = networks.predict(params, SIZES, before, batch.pokes).points
+    prediction = networks.predict(params, SIZES, before, batch.pokes)
+    predicted = prediction.points
     flow = optical_flow(before.points, predicted, data.camera).reshape(before.images.shape[:3] + (2,))
     maps = losses.distance_maps(predicted, after.points, valid, next_valid)
     start, end = networks.inverse_model(params, *batch.evidence)
@@ -94,7 +95,8 @@ def test_every_term_gets_its_own_arguments():
         "flow_smoothness": losses.flow_smoothness_loss(flow, before.images, before.valid),
         "inverse": losses.heatmap_cross_entropy(start, cells_of(data.starts, SETTINGS))
         + losses.heatmap_cross_entropy(end, cells_of(data.pokes[:, :2], SETTINGS))
-        + losses.embedding_loss(here, there)}
+        + losses.embedding_loss(here, there),
+        "binary_masks": losses.binary_mask_loss(prediction.masks)}
     found = loss_terms(params, SIZES, batch, data.camera)
     assert set(found) == set(expected) == set(WEIGHTS)
     for name, value in found.items():
@@ -162,7 +164,7 @@ def test_every_term_reaches_masks_motions_and_encoder(name):
     data, run = tiny_pokes(), random_run()
     parts = unflatten(gradient_of(run, make_batch(data, TINY, RNG(0)), data, {name: 1.0})[1], run.layout)
     assert parts["mask_w"].dtype == np.float32, "a derivative turned float32 into float64"
-    for reached in ("encoder_1_w", "mask_w", "motion_1_w"):
+    for reached in ("encoder_1_w", "mask_w", *["motion_1_w"] * (name != "binary_masks")):
         assert np.abs(parts[reached]).max() > 0, reached
     assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
 

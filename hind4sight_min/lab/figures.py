@@ -209,7 +209,7 @@ def interaction_figure(interactions, row, answer, truth):
 
 TERMS = {"chamfer": "$L_{CD}$ (Eq. 2), m$^2$", "distance_smoothness": "$L_{ds}$ (Eq. 5), m$^2$",
          "photometric": "$L_{rec}$ (Eq. 3), intensity", "flow_smoothness": "$L_{fs}$ (Eq. 4), px",
-         "inverse": "$L_{inv}$ (Sec. III-E), nats"}
+         "inverse": "$L_{inv}$ (Sec. III-E), nats", "binary_masks": "points between masks"}
 
 
 def training_figure(log):
