@@ -194,7 +194,7 @@ def next_plans(monkeypatch, *plans):
         found = next(coming, None)
         if found is None:
             raise planning.NoPoke("no room")
-        return Plan(found, None, np.nan, np.nan)
+        return Plan(found, np.nan, np.nan)
     monkeypatch.setattr(control, "next_plan", next_plan)
 
 
@@ -218,7 +218,7 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
 
 @pytest.mark.parametrize("cost, now, made", [(0.1, 0.39, 0), (0.96, 1.0, 0), (0.94, 1.0, 1)])
 def test_the_loop_ends_at_the_goal_and_where_a_poke_hardly_helps(cost, now, made, task, run, pokes, monkeypatch):
-    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, None, cost, now))
+    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, cost, now))
     assert len(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"]) == made
 
 

@@ -252,9 +252,8 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-RECIPE, SEARCH, SETTINGS = training.Recipe(), planning.Search(), Settings()
-SHIPPED = data_small() / "checkpoint.npz"
-CHECKPOINT, DATA = {"nargs": "?", "default": SHIPPED}, {"nargs": "?", "default": data_small() / "test"}
+SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz"}
+TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
 JSON = {"metavar": "FILE", "help": "write the figures here too"}
@@ -271,29 +270,29 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "out": {"help": "folder; one that holds a part of the same pokes is completed"},
         "--pokes": {"type": int, "default": 1000}, "--seed": SEED,
         "--objects": {"type": int, "nargs": 2, "metavar": ("MIN", "MAX"), "help": "objects in a scene, 1 to 7",
-                      "default": (SETTINGS.objects_min, SETTINGS.objects_max)},
-        "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (SETTINGS.width, SETTINGS.height),
-                   "help": f"of the pictures, px, 4:3 ({SETTINGS.width} {SETTINGS.height})"},
-        "--kinds": {"nargs": "+", "default": SETTINGS.kinds, "help": f"of {', '.join(KINDS)}"},
-        "--textures": {"nargs": "+", "default": SETTINGS.textures, "help": f"of {', '.join(TEXTURES)}"},
+                      "default": (Settings.objects_min, Settings.objects_max)},
+        "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
+                   "help": f"of the pictures, px, 4:3 ({Settings.width} {Settings.height})"},
+        "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
+        "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--jobs": JOBS, "--json": JSON}),
     "train": (run_train, "train the full model (Eq. 6) on a folder of shards, without labels", {
         "data": {"nargs": "?", "default": data_small() / "train"},
         "out": {"help": "checkpoint to write (.npz); its log goes beside it (.csv and .png)"},
-        **fields(RECIPE, "steps", "batch", "learning_rate", "optimiser", "seed", default=None),
-        **fields(RECIPE.sizes, "masks", "width", default=None),
+        **fields(training.Recipe(), "steps", "batch", "learning_rate", "optimiser", "seed", default=None),
+        **fields(Sizes(), "masks", "width", default=None),
         "--weight": {"type": term_weight, "action": "append", "metavar": "TERM=VALUE",
-                     "help": f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(RECIPE.weights)}"},
+                     "help": f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(training.WEIGHTS)}"},
         "--depth-noise": {"type": float, "help": "SD in m of the noise to train under (0)"},
         "--resume": {"action": "store_true", "help": "go on with the checkpoint OUT and its recipe"},
         "--jobs": JOBS, "--json": JSON}),
     "evaluate": (run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped ones", {
-        "checkpoint": CHECKPOINT, "data": DATA, "--json": JSON}),
+        "checkpoint": SHIPPED, "data": TEST, "--json": JSON}),
     "show": (run_show, "one interaction as a picture; without arguments, a shipped one", {
-        "checkpoint": CHECKPOINT, "data": DATA, "--out": {"default": "interaction.png"},
+        "checkpoint": SHIPPED, "data": TEST, "--out": {"default": "interaction.png"},
         "--row": {"type": int, "help": "which interaction (one that moves something well)"}}),
     "plan": (run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)", {
-        "checkpoint": CHECKPOINT,
+        "checkpoint": SHIPPED,
         "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
         "--objects": {"type": int, "default": 1, "choices": (1, 2, 3), "help": "how many are to be moved"},
         "--obstacle": {"action": "store_true", "help": "a scene with another object in the way"},
@@ -301,13 +300,13 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--goal": {**PIXEL, "help": "where that shall go"},
         "--policy": {"choices": control.POLICIES, "default": "learned"},
         "--budget": {"type": int, "default": 10, "help": "pokes at most"},
-        **fields(SEARCH, *SEARCH_OPTIONS),
+        **fields(planning.Search(), *SEARCH_OPTIONS),
         "--out": {"default": "runs/plan", "help": "folder for plan.gif"}, "--json": JSON}),
     "reproduce": (run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it can be "
                   "stopped and started again (needs pybullet)", {
         "table": {"choices": [*tables.TABLES, "all", "planning"],
                   "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G"},
-        "--checkpoint": {"default": SHIPPED, "help": "the model to plan with (the shipped one)"},
+        "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan with (the shipped one)"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/reproduce, runs/reproduce-quick, runs/planning)"},
         "--jobs": JOBS, "--json": JSON}),

@@ -202,7 +202,7 @@ def next_plan(policy, task, view, labels, goal, run, search, rng):
     if policy in ("random", "greedy"):
         pokes = (draw_pokes(rng, 1, view, settings)[0] if policy == "random"
                  else greedy_poke(view, goal, arena.camera, settings, rng))
-        return Plan(pokes, None, np.nan, np.nan)
+        return Plan(pokes, np.nan, np.nan)
     if policy == "oracle":
         rollout = oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings)
     else:
