@@ -178,8 +178,8 @@ PLANTED = (
         ("tested on the training pokes", '_data(out / "test")), depth_noise', '_data(out / "train")), depth_noise'),
         ("all tries identical", "seed=[seed, attempt]", "seed=seed"),
         ("the best distance so far", "np.pad(distance,", "np.pad(np.minimum.accumulate(distance),"),
-        ("the obstacle's shift measured on the mover", 'np.delete(poses, record["movers"], axis=1)',
-         'poses[:, record["movers"]]')]),
+        ("the obstacle's shift measured on the mover", 'np.delete(record["poses"][..., :2], record["movers"], axis=1)',
+         'record["poses"][:, record["movers"], :2]')]),
     ("lab/runs.py", "runs", [("an epoch's sums go on in the next", "sums.clear()", "pass")]),
     ("lab/processes.py", "se3nets", [
         ("chunks come back out of order", "for i, call in enumerate(calls):",
