@@ -146,7 +146,7 @@ PLANTED = (
     ("sim/collection.py", "sim_collection", [
         ("the labels of the second picture", "rgb_after, depth_after, _, poses_after",
          "rgb_after, depth_after, labels, poses_after")]),
-    ("sim/truth.py", "sim_truth", [("R_b for its transpose", "@ before[index]", "@ before[index].T")]),
+    ("sim/truth.py", "sim_truth", [("R_b for its transpose", "(before[3:]).inv()", "(before[3:])")]),
 
     ("lab/noise.py", "noise", [
         ("one noise for all pictures", "rng.standard_normal(depth.shape)", "rng.standard_normal(depth.shape[-2:])"),
@@ -172,18 +172,18 @@ PLANTED = (
         ("greedy pushes away from the goal", "places_at(goal.pixels, marks[:, 2], camera, settings) - marks[:, :2]",
          "marks[:, :2] - places_at(goal.pixels, marks[:, 2], camera, settings)"),
         ("the last poke of a plan first", "pokes.append(found.pokes[0])", "pokes.append(found.pokes[-1])"),
-        ("every sequence begins where the last one ended", "            arena.restore(start)\n            found",
-         "            found")]),
+        ("every sequence begins where the last one ended",
+         "            arena.bullet.restoreState(start)\n            found", "            found")]),
     ("lab/tables.py", "tables", [
         ("tested on the training pokes", '_data(out / "test")), depth_noise', '_data(out / "train")), depth_noise'),
         ("all tries identical", "seed=[seed, attempt]", "seed=seed"),
         ("the best distance so far", "np.pad(distance,", "np.pad(np.minimum.accumulate(distance),"),
-        ("the obstacle's shift measured on the mover", 'np.delete(poses, record["movers"], axis=1)',
-         'poses[:, record["movers"]]')]),
+        ("the obstacle's shift measured on the mover", 'np.delete(record["poses"][..., :2], record["movers"], axis=1)',
+         'record["poses"][:, record["movers"], :2]')]),
     ("lab/runs.py", "runs", [("an epoch's sums go on in the next", "sums.clear()", "pass")]),
     ("lab/processes.py", "se3nets", [
-        ("chunks come back out of order", "[given[i].result() if i in given else own[i] for i in range(len(calls))]",
-         "[*own.values(), *(each.result() for each in given.values())]")]),
+        ("chunks come back out of order", "for i, call in enumerate(calls):",
+         "for i, call in reversed([*enumerate(calls)]):")]),
     ("lab/cli.py", "cli", [
         ("--weight has no say", "{**training.WEIGHTS, **dict(weight)}", "{**dict(weight), **training.WEIGHTS}")]),
     ("lab/figures.py", "figures", [("heat-maps upside down", 'origin="lower"', 'origin="upper"')]),

@@ -244,9 +244,8 @@ def cem(cost, population, rng, search, on_iteration=None):
 
 @dataclass(frozen=True)
 class Plan:
-    """pokes (H, 3), starts (H, 2) m, cost of the best sequence; now: the cost of leaving all as it is."""
+    """pokes (H, 3) and cost of the best sequence; now: the cost of leaving all as it is."""
     pokes: np.ndarray
-    starts: np.ndarray
     cost: float
     now: float
 
@@ -263,5 +262,4 @@ def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None):
 
     first = draw_pokes(rng, search.candidates, view, settings, search.horizon)
     pokes, lowest = cem(cost, first, rng, search, on_iteration)
-    starts = rollout(pokes[None])[1][0]
-    return Plan(pokes, starts, lowest, float(planning_cost(view.cloud[None], view, goal, camera, search)[0]))
+    return Plan(pokes, lowest, float(planning_cost(view.cloud[None], view, goal, camera, search)[0]))

@@ -118,12 +118,13 @@ def test_the_report_shows_every_kind_of_poke_that_there_is(capsys):
     for i, group in enumerate(("", "single_", "multi_", "wall_", "trimmed_")):
         metrics.update({f"{group}flow_mse_ratio": 0.1 + 0.1 * i, f"{group}flow_mse_ratio_se": 0.011 * (i + 1),
                         f"{group}pokes" if group else "pokes_moved": 90 - i})
-    cli.print_metrics({**metrics, "multi_pokes": 0, "multi_flow_mse_ratio": np.nan})
+    del metrics["multi_flow_mse_ratio"], metrics["multi_flow_mse_ratio_se"]
+    cli.print_metrics({**metrics, "multi_pokes": 0})
     out = capsys.readouterr().out
     for line in ("0.100 \u00b1 0.011   90 pokes", "0.200 \u00b1 0.022   89 pokes", "0.400 \u00b1 0.044   87 pokes",
                  "0.500 \u00b1 0.055   86 pokes", "no motion", "chance 18"):
         assert line in out, out
-    assert "two or more" not in out and "nan" not in out
+    assert "two or more" not in out
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
@@ -169,13 +170,13 @@ def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsy
     assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
     data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
     assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
-    assert found["pokes_kept"] == 3 and 0 < found["collect_share_in_bullet"] <= 1
+    assert found["pokes_kept"] == 3 and found["collect_seconds"] > 0
     assert "3 pokes" in capsys.readouterr().out
 
 
 @needs_bullet
 @pytest.mark.parametrize("own_goal", [False, True])
-def test_plan_writes_a_record_an_animation_and_the_population(own_goal, small, tmp_path, capsys):
+def test_plan_says_and_draws_what_it_did(own_goal, small, tmp_path, capsys):
     with control.random_task(1, 1) as task:
         goal = ["--mark", *task.marks[0], "--goal", 32, 24] if own_goal else []
     assert run("plan", small / "checkpoint.npz", "--policy", "oracle", "--candidates", 8, "--iterations", 1, "--budget",
@@ -183,19 +184,17 @@ def test_plan_writes_a_record_an_animation_and_the_population(own_goal, small, t
     out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
     assert "poke 1 to (" in out and "cm from the goals" in out
     assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
-    for name, begin in (("plan.gif", b"GIF89a"), ("cem.png", b"\x89PNG"), ("plan.npz", b"PK")):
-        assert (tmp_path / name).read_bytes().startswith(begin), name
+    assert (tmp_path / "plan.gif").read_bytes().startswith(b"GIF89a")
 
 
 @needs_bullet
 @pytest.mark.parametrize("arguments, words", [
     (["--mark", 0, 47, "--goal", 32, 24], ["(0, 47) lies on the background"]),
     (["--mark", 99, 3, "--goal", 32, 24], ["(99, 3) lies outside the 64 x 48 picture"]),
-    (["--mark", 3, 3], ["--mark, --goal: expected both or neither"]), (["--click"], ["no display"]),
+    (["--mark", 3, 3], ["--mark, --goal: expected both or neither"]),
     (["--pixel-weight", -1], ["pixel_weight"]), (["--budget", 0], ["budget", "0"]), (["--seed", -1], ["seed", "-1"]),
     (["--objects", 2, "--obstacle"], ["movers", "obstacle"])])
-def test_plan_refuses_in_one_line(small, arguments, words, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
+def test_plan_refuses_in_one_line(small, arguments, words, tmp_path, capsys):
     one_line(capsys, run("plan", small / "checkpoint.npz", *arguments, "--out", tmp_path / "new"), *words)
     assert not (tmp_path / "new").exists()
 
@@ -203,17 +202,6 @@ def test_plan_refuses_in_one_line(small, arguments, words, tmp_path, capsys, mon
 def test_plan_searches_as_planning_does_unless_told():
     args = cli.build_parser().parse_args(["plan"])
     assert planning.Search(**{name: getattr(args, name) for name in cli.SEARCH_OPTIONS}) == planning.Search()
-
-
-def test_clicks_are_pairs(monkeypatch):
-    import matplotlib.pyplot as plt
-    monkeypatch.setattr(plt, "get_backend", lambda: "a window")
-    monkeypatch.setattr(plt, "ginput", lambda **_: [(1, 2), (3, 4), (5, 6), (7, 8)])
-    marks, goals = cli.click(np.zeros((4, 4, 3)))
-    assert marks.tolist() == [[1, 2], [5, 6]] and goals.tolist() == [[3, 4], [7, 8]]
-    monkeypatch.setattr(plt, "ginput", lambda **_: [(1, 2)])
-    with pytest.raises(ValueError, match="pairs of clicks"):
-        cli.click(np.zeros((4, 4, 3)))
 
 
 @pytest.fixture
@@ -248,7 +236,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     figures, out = short_demo()
     assert "demo_plan_distance_left" not in figures and not (tmp_path / "plan.gif").exists()
     assert out.count(cli.NO_BULLET) == 1 and "\n" not in cli.NO_BULLET and "pip install pybullet" in cli.NO_BULLET
-    assert short_demo()[0] == pytest.approx(figures, nan_ok=True), "a second time, the same"
+    assert short_demo()[0] == pytest.approx(figures), "a second time, the same"
     one_line(capsys, run("collect", tmp_path / "new", "--pokes", 1, "--jobs", 1), "pybullet", "pip install")
     assert not list(tmp_path.glob("new/*"))
 
@@ -257,7 +245,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
 
 @pytest.mark.parametrize("arguments, words", [
     ("evaluate no.npz", ["no.npz", "no such file"]), ("evaluate pokes/shard_0000.npz", ["shard_0000.npz", "format"]),
-    ("train nowhere out.npz", ["nowhere", "no such folder"]), ("train broken out.npz", ["shard_0000.npz", "damaged"]),
+    ("train nowhere out.npz", ["nowhere", "no shard_"]), ("train broken out.npz", ["shard_0000.npz", "damaged"]),
     ("train pokes out.npz --steps -1", ["steps", "-1"]), ("train pokes out.npz --batch 0", ["batch"]),
     ("train pokes out.npz --masks 1", ["masks"]), ("train pokes out.npz --jobs 0", ["jobs"]),
     ("train pokes out.npz --optimiser sgd", ["optimiser", "sgd"]),
@@ -279,9 +267,9 @@ def test_wrong_input_ends_in_one_line(arguments, words, small, tmp_path, capsys,
 
 
 def test_an_interrupt_ends_in_one_line(monkeypatch, capsys):
-    def interrupted(args):
+    def interrupted(*_):
         raise KeyboardInterrupt
-    monkeypatch.setattr(cli, "run_evaluate", interrupted)
+    monkeypatch.setattr(cli.evaluation, "evaluate", interrupted)
     assert run("evaluate") == 130
     assert capsys.readouterr().err == "\nhind4sight evaluate: stopped; what is on disk is whole\n"
 

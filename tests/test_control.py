@@ -29,13 +29,13 @@ def run():
 @pytest.fixture(scope="module")
 def shared_task():
     with control.random_task(2, 1) as task:
-        yield task, task.arena.snapshot()
+        yield task, task.arena.bullet.saveState()
 
 
 @pytest.fixture
 def task(shared_task):
     """A task with one object to move, at its start."""
-    shared_task[0].arena.restore(shared_task[1])
+    shared_task[0].arena.bullet.restoreState(shared_task[1])
     return shared_task[0]
 
 
@@ -158,7 +158,7 @@ def test_greedy_pushes_what_is_farthest_from_its_goal_towards_it(farthest, shift
 
 # --- the closed loop ------------------------------------------------------------------------------------------
 
-def test_closed_loop_brings_an_object_to_its_goal_and_can_be_replayed(tmp_path, run):
+def test_closed_loop_brings_an_object_to_its_goal(run):
     with control.random_task(0, 1) as task:
         record = control.closed_loop(task, run, "learned", Search(), budget=4, seed=0)
         for t, poses in enumerate(record["poses"]):
@@ -167,10 +167,8 @@ def test_closed_loop_brings_an_object_to_its_goal_and_can_be_replayed(tmp_path, 
     assert 1 <= count <= 4 and record["rgb"].shape == (count + 1, 48, 64, 3)
     assert record["marks"].shape == (count + 1, 1, 3) and np.isfinite(record["starts"]).all()
     assert record["distance"][-1, 0] < 0.35 * record["distance"][0, 0]
-    moved = control.carried(record["marks"][0], record["movers"], record["poses"][0], record["poses"][-1])
-    assert np.linalg.norm(moved - record["marks"][-1]) < 0.02, "the mark was lost"
-    control.save_record(tmp_path / "plan.npz", record, {"seed": 0, "movers": 1, "obstacle": False})
-    np.testing.assert_allclose(control.replay(tmp_path / "plan.npz"), record["poses"], atol=1e-4)
+    flow = true_scene_flow(record["marks"][0], record["movers"] + 1, record["poses"][0], record["poses"][-1])
+    assert np.linalg.norm(record["marks"][0] + flow - record["marks"][-1]) < 0.02, "the mark was lost"
 
 
 @pytest.mark.parametrize("policy", ["random", "greedy", "no_motion", "oracle"])
@@ -196,7 +194,7 @@ def next_plans(monkeypatch, *plans):
         found = next(coming, None)
         if found is None:
             raise planning.NoPoke("no room")
-        return Plan(found, None, np.nan, np.nan)
+        return Plan(found, np.nan, np.nan)
     monkeypatch.setattr(control, "next_plan", next_plan)
 
 
@@ -220,7 +218,7 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
 
 @pytest.mark.parametrize("cost, now, made", [(0.1, 0.39, 0), (0.96, 1.0, 0), (0.94, 1.0, 1)])
 def test_the_loop_ends_at_the_goal_and_where_a_poke_hardly_helps(cost, now, made, task, run, pokes, monkeypatch):
-    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, None, cost, now))
+    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, cost, now))
     assert len(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"]) == made
 
 

@@ -27,12 +27,12 @@ import numpy as np
 from autograd import grad
 from scipy.linalg import expm, expm_frechet
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from hind4sight_min import geometry
 from hind4sight_min.lab.evaluation import true_motion
 from hind4sight_min.lab.figures import PALETTE
 from hind4sight_min.lab.se3nets import association_loss
-from hind4sight_min.sim.truth import rotation_from_quaternion
 
 options = lesson.begin("02_rigid_motion")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -126,8 +126,8 @@ movers = np.unique(labels[moving])
 true_masks = (labels[:, None] == np.concatenate([[0], movers])).astype(float)[None]  # (1, N, K)
 true_masks[..., 0] = 1 - true_masks[..., 1:].sum(axis=-1)                            # what does not move is background
 before, after = (poses[ROW, movers - 1].astype(float) for poses in (truth.poses_before, truth.poses_after))
-turn_before, turn_after = (rotation_from_quaternion(poses[:, 3:]) for poses in (before, after))
-turns = np.matmul(turn_after, np.swapaxes(turn_before, 1, 2))           # R = R_after R_before^T
+turn_before, turn_after = (Rotation.from_quat(poses[:, 3:]) for poses in (before, after))
+turns = (turn_after * turn_before.inv()).as_matrix()                    # R = R_after R_before^T
 shifts = after[:, :3] - np.einsum("kij,kj->ki", turns, before[:, :3])  # T = c_after - R c_before
 true_rotations = np.concatenate([np.eye(3)[None], turns])[None]         # (1, K, 3, 3), the background's first
 true_translations = np.concatenate([np.zeros((1, 3)), shifts])[None]    # (1, K, 3)

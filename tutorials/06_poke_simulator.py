@@ -182,7 +182,7 @@ lesson.keep(options, figure, "film")
 # %%
 POKES = 40 if options.quick else 120
 if bullet:
-    recorded, truth, _ = collect_shard(Settings(), 1, 0, POKES)
+    recorded, truth = collect_shard(Settings(), 1, 0, POKES)
 else:
     recorded, truth = recorded[:POKES], truth[slice(POKES)]
 exists = np.abs(truth.poses_before).sum(axis=2) > 0                                # (M, 7): which rows hold an object

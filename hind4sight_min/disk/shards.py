@@ -42,17 +42,15 @@ def find_shards(folder):
 
 
 def shards_in(folder):
-    """The shards of a data set, in order. Raises ValueError if there is none."""
-    if not Path(folder).is_dir():
-        raise ValueError(f"{folder}: no such folder")
+    """The same; raises ValueError if there is none."""
     shards = find_shards(folder)
     if not shards:
-        raise ValueError(f"{folder}: no shard_*.npz in it; 'hind4sight collect' makes them")
+        raise ValueError(f"{folder}: no shard_*.npz there; 'hind4sight collect' makes them")
     return shards
 
 
 def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions. They must share camera, arena and grid."""
+    """All shards of a folder, joined -> Interactions. Raises ValueError unless they share camera, arena and grid."""
     paths = shards_in(folder)
     parts = [load_shard(path) for path in paths]
     first = parts[0]

@@ -5,17 +5,15 @@ import os
 import sys
 import sysconfig
 import time
-from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from .. import check_whole, planning, training
+from .. import planning, training
 from ..disk import checkpoints
 from ..disk.files import write_json
-from ..geometry import project
 from ..disk.shards import load_interactions
 from ..networks import Sizes
 from ..sim.arena import Settings
@@ -24,7 +22,7 @@ from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import load_truth
 from . import control, evaluation, tables
 from .noise import under_noise
-from .processes import pool_map
+from .processes import parallel_map
 from .runs import train_saving
 
 # `figures` is imported where a picture is made: Matplotlib takes a third of a second, in every worker process too.
@@ -80,24 +78,16 @@ def print_metrics(metrics):
 
 # --- commands ----------------------------------------------------------------------------------------------
 
-def simulate(folder, pokes, seed, jobs, settings=Settings()):
-    """`collect` over so many processes, with a line that says what came of it -> its counts and times."""
-    check_whole("jobs", jobs, 1)
-    with pool_map(jobs) as map:
-        result = collect(folder, pokes, seed, settings, map, progress_line("collect"))
-    counts, share = result["counts"], result["share_in_bullet"]
-    dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
-    spent = "all there already" if share is None else f"{share:.0%} of the time in Bullet's stepping and rendering"
-    print(f"{folder}: {counts['kept']} pokes in {result['seconds']:.1f} s; dropped: {dropped}; {spent}")
-    return result
-
-
 def run_collect(args):
     settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
                         textures=tuple(args.textures), width=args.size[0], height=args.size[1])
-    result = simulate(args.out, args.pokes, args.seed, args.jobs, settings)
-    write_json(args.json, {"collect_seconds": result["seconds"], "collect_share_in_bullet": result["share_in_bullet"],
-                           **{f"pokes_{name}": count for name, count in result["counts"].items()}})
+    began = time.perf_counter()
+    with parallel_map(args.jobs) as map:
+        counts = collect(args.out, args.pokes, args.seed, settings, map, progress_line("collect"))
+    seconds = time.perf_counter() - began
+    dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
+    print(f"{args.out}: {counts['kept']} pokes in {seconds:.1f} s; dropped: {dropped}")
+    write_json(args.json, {"collect_seconds": seconds, **{f"pokes_{name}": count for name, count in counts.items()}})
 
 
 def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, **given):
@@ -142,7 +132,6 @@ def run_train(args):
 
 def run_evaluate(args):
     run, interactions = checkpoints.load_run(args.checkpoint), load_interactions(args.data)
-    training.check_camera(run, interactions.camera)
     metrics = evaluation.evaluate(run, interactions, load_truth(args.data), progress_line("evaluate"))
     print_metrics(metrics)
     write_json(args.json, metrics)
@@ -152,7 +141,6 @@ def run_show(args):
     from . import figures
     run = checkpoints.load_run(args.checkpoint)
     interactions, truth = load_interactions(args.data), load_truth(args.data)
-    training.check_camera(run, interactions.camera)
     row = args.row
     if row is None:  # a poke that moved something well, not the best one
         motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
@@ -165,91 +153,45 @@ def run_show(args):
 
 
 def run_reproduce(args):
-    if args.table == "planning":
-        return run_reproduce_planning(args)
-    scale = tables.QUICK if args.quick else tables.FULL
-    names = list(tables.TABLES) if args.table == "all" else [args.table]
-    out = Path(args.out or ("runs/reproduce-quick" if args.quick else "runs/reproduce"))
-    found = tables.reproduce(names, out, scale, args.jobs, progress=progress_line("collect"))
-    print(tables.tables_text(names, found))
-    write_json(args.json or out / f"{args.table}.json", found)
-
-
-def run_reproduce_planning(args):
     from . import figures
-    out = Path(args.out or "runs/planning")
-    found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
-    print(tables.planning_table(found))
-    print(f"Obstacles avoided: planned {found['learned_obstacle_avoided']:.0%}, straight at the goal "
-          f"{found['greedy_obstacle_avoided']:.0%}")
-    figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
-    write_json(args.json or out / "figures.json", found)
+    control_experiment = args.table == "planning"
+    out = Path(args.out or ("runs/planning" if control_experiment
+                            else "runs/reproduce-quick" if args.quick else "runs/reproduce"))
+    if control_experiment:
+        found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
+        print(tables.planning_table(found))
+        figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
+    else:
+        names = list(tables.TABLES) if args.table == "all" else [args.table]
+        scale = tables.QUICK if args.quick else tables.FULL
+        found = tables.reproduce(names, out, scale, args.jobs, progress=progress_line("collect"))
+        print(tables.tables_text(names, found))
+    write_json(args.json or out / f"{args.table}.json", found)
 
 
 SEARCH_OPTIONS = "candidates", "iterations", "horizon", "pixel_weight", "chamfer_weight"
 
 
 def run_plan(args):
+    from . import figures
     run, options = checkpoints.load_run(args.checkpoint), {name: getattr(args, name) for name in SEARCH_OPTIONS}
     if (args.mark is None) != (args.goal is None):
         raise ValueError("--mark, --goal: expected both or neither; --goal says where a marked point shall go")
-    own = args.click or args.mark is not None
-    if own:
+    if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
-    search = planning.Search(**options)
+    search, path = planning.Search(**options), Path(args.out) / "plan.gif"
     with control.random_task(args.seed, args.objects, args.obstacle, control.settings_for(run)) as task:
-        training.check_camera(run, task.arena.camera)
-        if own:
-            marks, goals = click(task.arena.observe()[0]) if args.click else (args.mark, args.goal)
-            task = control.marked_task(task, marks, goals)
-        meta = {"seed": args.seed, "movers": args.objects, "obstacle": args.obstacle, "policy": args.policy,
-                "search": asdict(search)}
-        distance = plan_and_show(run, task, search, args.budget, Path(args.out), meta)
-    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0])})
-
-
-def plan_and_show(run, task, search, budget, out, meta):
-    """The closed loop on a task: a line per poke, and into the folder `out` a record, the first plan's population and
-    an animation -> mean distance to the goals at first and after every poke, m.
-    """
-    from . import figures
-    camera, rounds, image = task.arena.camera, [], task.arena.observe()[0] / 255
-
-    def on_iteration(iteration, population, costs, mean, deviation):
-        if len(rounds) == iteration:  # of the first plan
-            rounds.append((*figures.arrows_of(population[:, 0], task.settings, camera), costs))
-
-    record = control.closed_loop(task, run, meta["policy"], search, budget, meta["seed"], on_iteration)
-    distance, pokes, starts = record["distance"].mean(axis=1), record["pokes"], record["starts"]
-    for t, poke in enumerate(pokes):
-        done = "" if np.isfinite(starts[t]).all() else "  (no room for the finger: not carried out)"
+        if args.mark:
+            task = control.marked_task(task, args.mark, args.goal)
+        record = control.closed_loop(task, run, args.policy, search, args.budget, args.seed)
+    distance = record["distance"].mean(axis=1)  # m
+    for t, (poke, start) in enumerate(zip(record["pokes"], record["starts"])):
+        done = "" if np.isfinite(start).all() else "  (no room for the finger: not carried out)"
         print(f"  poke {t + 1} to ({poke[0]:6.3f}, {poke[1]:6.3f}) m, direction {np.degrees(poke[2]):4.0f} deg: "
               f"{100 * distance[t]:5.1f} -> {100 * distance[t + 1]:5.1f} cm from the goals{done}")
-    control.save_record(out / "plan.npz", record, meta)
-    marks, goals = project(record["marks"], camera), record["goal_marks"]
-    figures.save_sequence(out / "plan.gif", record["rgb"] / 255, record["goal_rgb"] / 255 if task.goal else None,
-                          figures.on_table(np.stack([starts, pokes[:, :2]], axis=1), camera), marks, goals, distance)
-    if rounds:
-        figures.save_figure(figures.population_figure(image, rounds, marks[0], goals), out / "cem.png")
-    print(f"{out}/plan.gif: {len(pokes)} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
-    return distance
-
-
-def click(image):
-    """Let the user click in a window: a point on an object, then where it shall go, and so on; Enter ends.
-
-    -> marks, goals (M, 2) px. Raises ValueError for an odd number of clicks or none, RuntimeError without a display.
-    """
-    import matplotlib.pyplot as plt
-    if plt.get_backend().lower() == "agg":
-        raise RuntimeError("--click: there is no display to open a window on; give --mark and --goal in pixels instead")
-    plt.imshow(image)
-    plt.title("click a point on an object, then its goal; and so on; Enter ends")
-    points = np.array(plt.ginput(n=-1, timeout=0))
-    plt.close()
-    if len(points) == 0 or len(points) % 2:
-        raise ValueError(f"--click: expected pairs of clicks, a mark and its goal, got {len(points)}")
-    return points[::2], points[1::2]
+    figures.save_sequence(path, record, task.arena.camera)
+    print(f"{path}: {len(distance) - 1} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0])})
 
 
 # --- the demo ----------------------------------------------------------------------------------------------
@@ -310,83 +252,79 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
+SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz"}
+TEST = {"nargs": "?", "default": data_small() / "test"}
+SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
+JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
+JSON = {"metavar": "FILE", "help": "write the figures here too"}
+
+
+def fields(record, *names, **how):
+    """Options for some fields of a record of settings, which has their defaults."""
+    return {"--" + name.replace("_", "-"): {"type": type(value), "default": value, "help": f"default {value}", **how}
+            for name, value in vars(record).items() if name in names}
+
+
+COMMANDS = {  # name: what runs it, what it does, its arguments as argparse takes them
+    "collect": (run_collect, "simulate pokes and write them to a folder of shards (needs pybullet)", {
+        "out": {"help": "folder; one that holds a part of the same pokes is completed"},
+        "--pokes": {"type": int, "default": 1000}, "--seed": SEED,
+        "--objects": {"type": int, "nargs": 2, "metavar": ("MIN", "MAX"), "help": "objects in a scene, 1 to 7",
+                      "default": (Settings.objects_min, Settings.objects_max)},
+        "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
+                   "help": f"of the pictures, px, 4:3 ({Settings.width} {Settings.height})"},
+        "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
+        "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
+        "--jobs": JOBS, "--json": JSON}),
+    "train": (run_train, "train the full model (Eq. 6) on a folder of shards, without labels", {
+        "data": {"nargs": "?", "default": data_small() / "train"},
+        "out": {"help": "checkpoint to write (.npz); its log goes beside it (.csv and .png)"},
+        **fields(training.Recipe(), "steps", "batch", "learning_rate", "optimiser", "seed", default=None),
+        **fields(Sizes(), "masks", "width", default=None),
+        "--weight": {"type": term_weight, "action": "append", "metavar": "TERM=VALUE",
+                     "help": f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(training.WEIGHTS)}"},
+        "--depth-noise": {"type": float, "help": "SD in m of the noise to train under (0)"},
+        "--resume": {"action": "store_true", "help": "go on with the checkpoint OUT and its recipe"},
+        "--jobs": JOBS, "--json": JSON}),
+    "evaluate": (run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped ones", {
+        "checkpoint": SHIPPED, "data": TEST, "--json": JSON}),
+    "show": (run_show, "one interaction as a picture; without arguments, a shipped one", {
+        "checkpoint": SHIPPED, "data": TEST, "--out": {"default": "interaction.png"},
+        "--row": {"type": int, "help": "which interaction (one that moves something well)"}}),
+    "plan": (run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)", {
+        "checkpoint": SHIPPED,
+        "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
+        "--objects": {"type": int, "default": 1, "choices": (1, 2, 3), "help": "how many are to be moved"},
+        "--obstacle": {"action": "store_true", "help": "a scene with another object in the way"},
+        "--mark": {**PIXEL, "help": "a pixel on an object, again for each; --goal as often, in place of the scene's"},
+        "--goal": {**PIXEL, "help": "where that shall go"},
+        "--policy": {"choices": control.POLICIES, "default": "learned"},
+        "--budget": {"type": int, "default": 10, "help": "pokes at most"},
+        **fields(planning.Search(), *SEARCH_OPTIONS),
+        "--out": {"default": "runs/plan", "help": "folder for plan.gif"}, "--json": JSON}),
+    "reproduce": (run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it can be "
+                  "stopped and started again (needs pybullet)", {
+        "table": {"choices": [*tables.TABLES, "all", "planning"],
+                  "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G"},
+        "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan with (the shipped one)"},
+        "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
+        "--out": {"help": "folder of data and runs (runs/reproduce, runs/reproduce-quick, runs/planning)"},
+        "--jobs": JOBS, "--json": JSON}),
+    "demo": (run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, train, "
+             "evaluate and show on the shipped pokes", {
+        "--out": {"default": "runs/demo"}, "--seed": SEED, "--jobs": JOBS, "--json": JSON}),
+}
+
+
 def build_parser():
-    """The parser of all commands; each sets `function`, which `main` calls with the arguments."""
+    """The parser of all COMMANDS; each sets `function`, which `main` calls with the arguments."""
     parser = OneLineParser(prog="hind4sight", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    settings, recipe = Settings(), training.Recipe()
-    shared = {"checkpoint": {"nargs": "?", "default": data_small() / "checkpoint.npz"},
-              "data": {"nargs": "?", "default": data_small() / "test"}, "--seed": {"type": int, "default": 0},
-              "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"},
-              "--json": {"metavar": "FILE", "help": "write the figures here too"}}
-
-    def command(name, function, text, *options):
-        sub = commands.add_parser(name, help=text, description=text)
-        sub.set_defaults(function=function)
-        for option in options:
-            sub.add_argument(option, **shared[option])
-        return sub.add_argument
-
-    def add_fields(add, record, *names, **how):
-        for name in names:
-            value = getattr(record, name)
-            options = {"default": value, "help": f"default {value}", **how}
-            add("--" + name.replace("_", "-"), type=type(value), **options)
-
-    add = command("collect", run_collect, "simulate pokes and write them to a folder of shards (needs pybullet)",
-                  "--seed", "--jobs", "--json")
-    add("out", help="folder; one that holds a part of the same pokes is completed")
-    add("--pokes", type=int, default=1000)
-    add("--objects", type=int, nargs=2, metavar=("MIN", "MAX"), default=(settings.objects_min, settings.objects_max),
-        help="objects in a scene, 1 to 7")
-    add("--size", type=int, nargs=2, metavar=("W", "H"), default=(settings.width, settings.height),
-        help=f"of the pictures, px, 4:3 ({settings.width} {settings.height})")
-    add("--kinds", nargs="+", default=settings.kinds, help=f"of {', '.join(KINDS)}")
-    add("--textures", nargs="+", default=settings.textures, help=f"of {', '.join(TEXTURES)}")
-
-    add = command("train", run_train, "train the full model (Eq. 6) on a folder of shards, without labels",
-                  "--jobs", "--json")
-    add("data", nargs="?", default=data_small() / "train")
-    add("out", help="checkpoint to write (.npz); its log goes beside it (.csv and .png)")
-    add_fields(add, recipe, "steps", "batch", "learning_rate", "optimiser", "seed", default=None)
-    add_fields(add, recipe.sizes, "masks", "width", default=None)
-    add("--weight", type=term_weight, action="append", metavar="TERM=VALUE",
-        help=f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(recipe.weights)}")
-    add("--depth-noise", type=float, help="SD in m of the noise to train under (0)")
-    add("--resume", action="store_true", help="go on with the checkpoint OUT and its recipe")
-
-    command("evaluate", run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped "
-            "ones", "checkpoint", "data", "--json")
-    add = command("show", run_show, "one interaction as a picture; without arguments, a shipped one", "checkpoint",
-                  "data")
-    add("--row", type=int, help="which interaction (one that moves something well)")
-    add("--out", default="interaction.png")
-
-    add = command("plan", run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)",
-                  "checkpoint", "--json")
-    add("--seed", type=int, default=0, help=f"which scene ({tables.TRAIN_SEED} has objects that were trained on)")
-    add("--objects", type=int, default=1, choices=(1, 2, 3), help="how many are to be moved")
-    add("--obstacle", action="store_true", help="a scene with another object in the way")
-    add("--mark", type=float, nargs=2, action="append", metavar=("X", "Y"),
-        help="a pixel on an object, again for each; with as many --goal, in place of the scene's")
-    add("--goal", type=float, nargs=2, action="append", metavar=("X", "Y"), help="where that shall go")
-    add("--click", action="store_true", help="choose marks and goals in a window")
-    add("--policy", choices=control.POLICIES, default="learned")
-    add("--budget", type=int, default=10, help="pokes at most")
-    add_fields(add, planning.Search(), *SEARCH_OPTIONS)
-    add("--out", default="runs/plan", help="folder for plan.gif, cem.png and the record plan.npz")
-
-    add = command("reproduce", run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it "
-                  "can be stopped and started again (needs pybullet)", "--jobs", "--json")
-    add("table", choices=[*tables.TABLES, "all", "planning"],
-        help="all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G")
-    add("--checkpoint", help="the model to plan with (the shipped one)", default=data_small() / "checkpoint.npz")
-    add("--quick", action="store_true", help="the same tables from little data, in under ten minutes")
-    add("--out", help="folder of data and runs (runs/reproduce, runs/reproduce-quick)")
-
-    add = command("demo", run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, "
-                  "train, evaluate and show on the shipped pokes", "--seed", "--jobs", "--json")
-    add("--out", default="runs/demo")
+    for name, (function, text, arguments) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text)
+        command.set_defaults(function=function)
+        for argument, how in arguments.items():
+            command.add_argument(argument, **how)
     return parser
 
 

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .. import check_whole
-from ..disk.files import load_npz, save_npz
 from ..geometry import project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
@@ -20,11 +20,10 @@ from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_
                         view_of)
 from ..scene import scene_of
 from ..sim.arena import Arena, Settings
-from ..sim.truth import rotation_from_quaternion, true_scene_flow
+from ..sim.truth import true_scene_flow
 from ..training import check_camera
 from .marks import follow, places_at, points_at
 
-FORMAT = "hind4sight_min plan 1"
 SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
 IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
@@ -88,19 +87,20 @@ def _draw_goal(arena, movers, obstacle, rng):
     """A Task for the scene that stands in the arena, or None where the goal that was drawn cannot be."""
     if obstacle and not _line_up(arena, rng):
         return None
-    start, poses = arena.snapshot(), arena.poses()
+    start, poses = arena.bullet.saveState(), arena.poses()
     chosen = np.arange(1) if obstacle else rng.permutation(len(arena.bodies))[:movers]
     if len(chosen) < movers or not _set_goal(arena, chosen, rng, -poses[0, :2] if obstacle else None):
         return None
     (rgb, depth, labels), goal_poses = arena.observe(), arena.poses()
-    arena.restore(start)
+    arena.bullet.restoreState(start)
     _, depth_now, labels_now = arena.observe()
     if any(np.sum(picture == i + 1) < 12 for picture in (labels, labels_now) for i in range(len(arena.bodies))):
         return None  # hardly in sight
     marked = np.append(chosen, 1) if obstacle else chosen
     marks = np.array([_mark(labels_now, depth_now, arena.camera, i) for i in marked])
     points = unproject(depth_now, arena.camera)[marks[:, 1], marks[:, 0]]
-    goal_marks = project(carried(points, marked, poses, goal_poses), arena.camera)
+    there = points + true_scene_flow(points, marked + 1, poses, goal_poses)
+    goal_marks = project(there, arena.camera)
     return Task(arena, chosen, marked, marks, goal_marks, goal_poses, (rgb, depth))
 
 
@@ -159,17 +159,11 @@ def _mark(labels, depth, camera, index):
     return np.array([columns[away.argmin()], rows[away.argmin()]])
 
 
-def carried(points, objects, before, after):
-    """Where points (M, 3) m on the objects of these indices (M,) are once these went from poses `before` to `after`."""
-    flow = true_scene_flow(np.asarray(points, np.float64), np.asarray(objects) + 1, before, after)
-    return (points + flow).astype(np.float32)
-
-
 # --- planners -----------------------------------------------------------------------------------------------------
 
 def oracle_rollout(arena, view, labels, settings):
     """The simulator as a rollout: every sequence is carried out, and undone. labels (N + M,): truth."""
-    start, poses = arena.snapshot(), arena.poses()
+    start, poses = arena.bullet.saveState(), arena.poses()
 
     def step(clouds, pokes):
         place = first_start(possible_starts(pokes, occupied_grid(clouds, view.occupied, settings), settings))[0]
@@ -180,9 +174,9 @@ def oracle_rollout(arena, view, labels, settings):
     def rollout(sequences):
         found = []
         for sequence in sequences:
-            arena.restore(start)
+            arena.bullet.restoreState(start)
             found.append(roll(step, view, sequence[None], settings))
-        arena.restore(start)
+        arena.bullet.restoreState(start)
         return tuple(np.concatenate(each) for each in zip(*found))
     return rollout
 
@@ -202,19 +196,19 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
-def next_plan(policy, task, view, labels, goal, run, search, rng, on_iteration=None):
+def next_plan(policy, task, view, labels, goal, run, search, rng):
     """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle."""
     arena, settings = task.arena, task.settings
     if policy in ("random", "greedy"):
         pokes = (draw_pokes(rng, 1, view, settings)[0] if policy == "random"
                  else greedy_poke(view, goal, arena.camera, settings, rng))
-        return Plan(pokes, None, np.nan, np.nan)
+        return Plan(pokes, np.nan, np.nan)
     if policy == "oracle":
         rollout = oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings)
     else:
         step = learned_step(run, view) if policy == "learned" else lambda clouds, pokes: clouds
         rollout = partial(roll, step, view, settings=settings)
-    return plan(rollout, view, goal, arena.camera, settings, search, rng, on_iteration)
+    return plan(rollout, view, goal, arena.camera, settings, search, rng)
 
 
 # --- the closed loop ----------------------------------------------------------------------------------------------
@@ -247,19 +241,19 @@ def distances(poses, task):
     for round ones.
     """
     here, there = poses[task.movers], task.goal_poses[task.movers]
-    turn = np.einsum("mij,mkj->mik", rotation_from_quaternion(here[:, 3:]), rotation_from_quaternion(there[:, 3:]))
+    turn = (Rotation.from_quat(here[:, 3:]) * Rotation.from_quat(there[:, 3:]).inv()).as_matrix()
     angle = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
     angle[[task.arena.kinds[i] == "can" for i in task.movers]] = np.nan
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 
-def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None):
+def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent -> a dict.
 
     policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
-    Of T pokes: rgb (T+1, H, W, 3), depth (T+1, H, W), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance
-    (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task
-    movers, goal_marks, goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
+    Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance (T+1, M) m, angle
+    (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task movers, goal_marks,
+    goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
     first poke is possible; later on that ends the loop, as an empty arena does.
     """
     if policy not in POLICIES:
@@ -268,10 +262,10 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
     arena, rng = task.arena, np.random.default_rng(seed)
     check_camera(run, arena.camera)
     (rgb, depth, labels), view, goal = first_look(task)
-    states, pokes, starts = [(rgb, depth, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
+    states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
     while len(pokes) < budget:
         try:
-            found = next_plan(policy, task, view, labels, goal, run, search, rng, on_iteration)
+            found = next_plan(policy, task, view, labels, goal, run, search, rng)
         except NoPoke:
             if not pokes:
                 raise
@@ -284,30 +278,10 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, on_iteration=None)
         scene = scene_in(arena, rgb, depth)
         if np.isfinite(starts[-1]).all():
             marks = follow(view, predict(run.params, run.recipe.sizes, view.scene, pokes[-1][None]), scene)
-        states.append((rgb, depth, arena.poses(), marks, *distances(arena.poses(), task)))
+        states.append((rgb, arena.poses(), marks, *distances(arena.poses(), task)))
         if not scene.occupied.any():  # the last object left the arena
             break
         view = view_of(scene, marks)
-    record = dict(zip(("rgb", "depth", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
+    record = dict(zip(("rgb", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
     return {**record, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
             "movers": task.movers, "goal_marks": task.goal_marks, **({"goal_rgb": task.goal[0]} if task.goal else {})}
-
-
-def save_record(path, record, meta):
-    """Write what `closed_loop` returned, whole or not at all; meta: the task's seed, movers, obstacle, for `replay`."""
-    save_npz(path, record, {"format": FORMAT, **meta})
-
-
-def replay(path, settings=SETTINGS):
-    """Carry out the pokes of a saved record in a fresh arena -> poses (T+1, 7, 7), those of the record.
-
-    Bullet repeats itself to within some micrometres, unless objects collide with objects: that may amplify.
-    """
-    record, meta = load_npz(path, FORMAT)
-    with random_task(meta["seed"], meta["movers"], meta["obstacle"], settings) as task:
-        poses = [task.arena.poses()]
-        for poke, start in zip(record["pokes"], record["starts"]):
-            if np.isfinite(start).all() and task.arena.descent_is_free(*start):
-                task.arena.poke(poke, start)
-            poses.append(task.arena.poses())
-    return np.stack(poses)

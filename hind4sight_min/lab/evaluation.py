@@ -11,7 +11,7 @@ from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
 from ..scene import Scene, most_changed
 from ..sim.truth import true_scene_flow
-from ..training import scenes_of
+from ..training import check_camera, scenes_of
 from .noise import with_depth_noise
 
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
@@ -34,8 +34,9 @@ class Answer:
 
 def ask(run, interactions, row, depth_noise=0.0):
     """The whole model on one row of a data set -> Answer. depth_noise: SD in m of the noise it sees the depth with, the
-    same at every call, another for every row.
+    same at every call, another for every row. Raises ValueError for another camera than the run was trained with.
     """
+    check_camera(run, interactions.camera)
     one = interactions[[row]]
     if depth_noise:
         one = with_depth_noise(one, depth_noise, np.random.default_rng([0, row]))
@@ -86,12 +87,9 @@ def matched_iou(masks, labels, moved):
     A pixel belongs to its largest mask. An object without a mask scores 0.
     """
     from scipy.optimize import linear_sum_assignment  # here: it takes as long to import as all the rest
-    hard = np.argmax(masks, axis=1)
-    iou = np.zeros((len(moved), masks.shape[1] - 1))
-    for i, label in enumerate(moved):
-        for k in range(1, masks.shape[1]):
-            union = np.count_nonzero((labels == label) | (hard == k))
-            iou[i, k - 1] = np.count_nonzero((labels == label) & (hard == k)) / max(union, 1)
+    objects = labels == np.reshape(moved, (-1, 1, 1))  # (M, 1, N)
+    predicted = np.argmax(masks, axis=1) == np.arange(1, masks.shape[1])[:, None]  # (K-1, N)
+    iou = np.sum(objects & predicted, axis=2) / np.maximum(np.sum(objects | predicted, axis=2), 1)
     rows, columns = linear_sum_assignment(-iou)
     result = np.zeros(len(moved))
     result[rows] = iou[rows, columns]
@@ -154,11 +152,7 @@ def scenes_of_pokes(truth):
 def ratio_of(squared, motion, scenes):
     """Squared error over squared motion, both (M,), summed over pokes, and the ratio's standard error: by how much as
     many other scenes (M,) would change it (delta method; pokes of a scene are not independent). Not in the paper.
-
-    NaN where nothing moved.
     """
-    if not np.sum(motion) > 0:
-        return float("nan"), float("nan")
     ratio = np.sum(squared) / np.sum(motion)
     return ratio, np.sqrt(np.sum(np.bincount(scenes, squared - ratio * motion) ** 2)) / np.sum(motion)
 
@@ -169,11 +163,11 @@ def summary(pokes, true_pokes, scenes):
     flow_mse_ratio: squared error over squared motion, both summed over all moving points of the set (pooled);
     an interaction in which nothing moved has no moving point and so no say in it (it still counts for
     still_epe_cm). The same for pokes that moved one object (single_), two or more (multi_), ended at a wall (wall_),
-    and without the hundredth of the pokes with the largest squared errors (trimmed_). flow_mse_cm2, flow_rmse_cm,
-    flow_epe_cm: over moving points; no_motion_* the same for predicting no motion. still_epe_cm: mean drift of points
-    that do not move; all_epe_cm: of all points. mask_iou: mean over the objects that moved. optical_epe_px: over moving
-    points; optical_epe_all_px: over all. inverse_*: medians, over pokes that moved something; inverse_*_chance: of a
-    poke drawn from the set at random. Raises ValueError where nothing moved at all.
+    and without the hundredth of the pokes with the largest squared errors (trimmed_); a group without a poke has no
+    ratio. flow_mse_cm2, flow_rmse_cm, flow_epe_cm: over moving points; no_motion_* the same for predicting no motion.
+    still_epe_cm: mean drift of points that do not move; all_epe_cm: of all points. mask_iou: mean over the objects that
+    moved. optical_epe_px: over moving points; optical_epe_all_px: over all. inverse_*: medians, over pokes that moved
+    something; inverse_*_chance: of a poke drawn from the set at random. Raises ValueError where nothing moved at all.
     """
     of = {name: np.array([poke[name] for poke in pokes], float) for name in pokes[0] if name not in ("iou", "poke")}
     total = {name: values.sum() for name, values in of.items()}
@@ -181,6 +175,7 @@ def summary(pokes, true_pokes, scenes):
         raise ValueError("interactions: nothing moved in any of them, so there is nothing to measure")
     moving, everything = total["moving"], total["moving"] + total["still"]
     objects, squared, motion = np.array([len(poke["iou"]) for poke in pokes]), of["squared_error"], of["squared_motion"]
+    moved = objects > 0
     result = {
         "flow_mse_cm2": 1e4 * squared.sum() / moving,
         "flow_rmse_cm": 100 * np.sqrt(squared.sum() / moving),
@@ -195,16 +190,16 @@ def summary(pokes, true_pokes, scenes):
         "no_motion_optical_epe_px": total["optical_zero"] / moving,
         "optical_epe_all_px": total["optical_all"] / everything,
         "no_motion_optical_epe_all_px": total["optical_zero_all"] / everything,
-        "pokes": len(pokes), "pokes_moved": np.count_nonzero(objects),
+        "pokes": len(pokes), "pokes_moved": moved.sum(),
     }
-    usual = squared <= np.quantile(squared, 0.99)
-    for group, of_group in (("", objects >= 0), ("single_", objects == 1), ("multi_", objects > 1),
-                            ("wall_", of["at_wall"] > 0), ("trimmed_", usual)):
-        ratio, error = ratio_of(squared[of_group], motion[of_group], scenes[of_group])
-        result.update({f"{group}flow_mse_ratio": ratio, f"{group}flow_mse_ratio_se": error})
-        if group:
-            result[f"{group}pokes"] = np.count_nonzero(of_group & (objects > 0))
-    found, true_pokes = np.stack([poke["poke"] for poke in pokes])[objects > 0], true_pokes[objects > 0]
+    groups = {"single_": objects == 1, "multi_": objects > 1, "wall_": moved & (of["at_wall"] > 0),
+              "trimmed_": moved & (squared <= np.quantile(squared, 0.99))}
+    for group, rows in {"": moved, **groups}.items():
+        if rows.any():
+            ratio, error = ratio_of(squared[rows], motion[rows], scenes[rows])
+            result.update({f"{group}flow_mse_ratio": ratio, f"{group}flow_mse_ratio_se": error})
+    result.update({f"{group}pokes": rows.sum() for group, rows in groups.items()})
+    found, true_pokes = np.stack([poke["poke"] for poke in pokes])[moved], true_pokes[moved]
     shuffled = true_pokes[np.random.default_rng(0).permutation(len(true_pokes))]
     for suffix, guess in (("", found), ("_chance", shuffled)):
         target, direction = poke_errors(guess, true_pokes)

@@ -25,17 +25,6 @@ PREDICTED, TRUE, GOAL, POKE = PALETTE[5], PALETTE[6], PALETTE[4], "black"
 OUTLINE = [withStroke(linewidth=3.5, foreground="white"), Normal()]  # lines stay visible on any picture
 
 
-def _checked(name, value, *shape, low=-np.inf, high=np.inf):
-    """`value` as a float array of this shape (None: any size) or a ValueError that says what is wrong."""
-    value = np.asarray(value, float)
-    if len(shape) != value.ndim or any(want not in (None, got) for want, got in zip(shape, value.shape)):
-        expected = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name}: expected shape ({expected}), got {value.shape}")
-    if not ((value >= low) & (value <= high) & np.isfinite(value)).all():
-        raise ValueError(f"{name}: expected finite numbers in [{low}, {high}], got {value.min():g} to {value.max():g}")
-    return value
-
-
 # --- optical flow as colours ---------------------------------------------------------------------------
 
 def flow_to_rgb(flow, scale):
@@ -47,7 +36,8 @@ def flow_to_rgb(flow, scale):
     flow (H, W, 2) px, V down; scale: the length in px drawn in full colour -> (H, W, 3) in [0, 1].
     Raises ValueError for another shape, for NaN, and for a scale that is not positive.
     """
-    flow = _checked("flow", flow, None, None, 2)
+    if flow.ndim != 3 or flow.shape[2] != 2 or not np.isfinite(flow).all():
+        raise ValueError(f"flow: expected finite pixels (H, W, 2), got shape {flow.shape}, or NaN or infinity")
     if not 0 < scale < np.inf:
         raise ValueError(f"scale: expected a finite number of pixels > 0, got {scale}")
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi)
@@ -123,29 +113,46 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
 
 
-def _draw_flows(panels, flows, target):
-    """Optical flows (H, W, 2) on one scale; on the first the wheel, above or below, away from the target (2,) px."""
-    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for *_, flow in flows))  # px
-    for label, title, flow in flows:
-        show_image(panels[label], flow_to_rgb(flow, scale), title)
-    axes, y = panels[flows[0][0]], 0.68 if target[1] > len(flows[0][2]) / 2 else 0.02
+def _draw_wheel(axes, scale, low):
+    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px."""
+    y = 0.02 if low else 0.68
     wheel = axes.inset_axes((0.02, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))
     wheel.axis("off")
     axes.text(0.28, y + 0.15, f"rim:\n{scale:.1f} px", fontsize=9, va="center", transform=axes.transAxes)
 
 
-def _draw_heatmaps(panels, heatmaps, true, arena):
-    """Two heat-maps over the arena's cells, and the true place (2,) m in each."""
-    for which, symbol, heatmap, place in zip(("start", "end"), "AB", heatmaps, true):
-        axes, half = panels[which], arena / 2
-        axes.set(title=f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)", **ARENA)
-        shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
-                            extent=(-half, half, -half, half))
-        axes.plot(*place, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
-                  label=f"true {which}")
-        axes.legend(loc="lower right" if place[1] > 0 else "upper right", framealpha=0.85)  # away from the mark
-        axes.figure.colorbar(shown, ax=axes, label="probability")
+def _draw_heatmap(axes, heatmap, place, arena, which, symbol):
+    """A heat-map over the arena's cells, and the true place (2,) m in it."""
+    half = arena / 2
+    axes.set(title=f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)", **ARENA)
+    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
+                        extent=(-half, half, -half, half))
+    axes.plot(*place, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
+              label=f"true {which}")
+    axes.legend(loc="lower right" if place[1] > 0 else "upper right", framealpha=0.85)  # away from the mark
+    axes.figure.colorbar(shown, ax=axes, label="probability")
+
+
+def _draw_losses(panels, answer):
+    """What Eq. (3) and (2) compare: the warped image and its error, and the distance maps."""
+    before, after, image = answer.before, answer.after, answer.before.images[0]
+    valid, next_valid = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    warped, in_view = warp_backward(after.images, answer.flow[None])
+    show_image(panels["warped"], np.clip(warped[0], 0, 1),
+               "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
+    error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
+    error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
+    shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
+                       cmap=colormaps["magma"].with_extremes(bad="0.6"), vmin=0)
+    panels["error"].figure.colorbar(shown, ax=panels["error"], label="sum over R, G, B", **BELOW)
+    distances = 100 * np.sqrt(distance_maps(answer.prediction.points, after.points, valid, next_valid))  # cm
+    both = [panels["distance_predicted"], panels["distance_observed"]]
+    titles = "predicted to observed\n$D_{\\hat P \\to P}$", "observed to predicted\n$D_{P \\to \\hat P}$"
+    for axes, title, distance in zip(both, titles, distances):
+        shown = show_image(axes, distance.reshape(error.shape), f"Distance {title} (Eq. 2)", vmin=0,
+                           vmax=distances.max())
+    both[0].figure.colorbar(shown, ax=both, label="square root of D, cm", **BELOW)
 
 
 # --- one poke, one training run ------------------------------------------------------------------------------
@@ -157,53 +164,39 @@ def interaction_figure(interactions, row, answer, truth):
     truth: of the whole data set. A mask's colour is its place in PALETTE, an object's that of its number.
     """
     camera, settings, before, after = interactions.camera, interactions.settings, answer.before, answer.after
-    poke, start, shape = interactions.pokes[row], interactions.starts[row], (camera.height, camera.width)
-    image, points, valid = before.images[0], before.points[0], before.valid[0]
+    poke, start, image = interactions.pokes[row], interactions.starts[row], before.images[0]
+    points, valid, labels = before.points[0], before.valid[0], truth.labels[row]
     true, true_pixels, moving = true_motion(interactions, truth, row)
+    numbers = np.arange(1, 1 + max(1, labels.max()))
+    moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(labels.shape)])
+    flows = [flow.reshape(*labels.shape, 2) * valid.reshape(*labels.shape, 1) for flow in (answer.flow, true_pixels)]
+    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for flow in flows))  # px
+
     figure = Figure(figsize=(14, 8.5), dpi=100, layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.7, 1))
     panels = {**upper.subplot_mosaic([["before", "masks", "labels", "flow", "true_flow"],
                                       ["after", "warped", "error", "distance_predicted", "distance_observed"]]),
               **lower.subplot_mosaic([["scene_flow", "start", "end"]], width_ratios=(1.7, 1, 1))}
     figure.suptitle(f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0", fontsize=13)
-
+    for label, title, picture in (
+            ("before", "Before: image $I_t$\nand the poke $u_t$", image),
+            ("after", "After: image $I_{t+1}$", after.images[0]),
+            ("masks", "Predicted masks $m_t^k$ (Eq. 1)\na colour each",
+             blend(image, answer.prediction.masks[0, :, 1:].reshape(*labels.shape, -1))),
+            ("labels", "True objects that moved\n(colours of their own)", blend(image, moved.astype(float))),
+            ("flow", "Predicted optical flow\n(U, V), Sec. III-C", flow_to_rgb(flows[0], scale)),
+            ("true_flow", "True optical flow\n(same colours)", flow_to_rgb(flows[1], scale))):
+        show_image(panels[label], picture, title)
     arrow = on_table([start, poke[:2]], camera)
-    show_image(panels["before"], image, "Before: image $I_t$\nand the poke $u_t$")
     draw_arrow(panels["before"], *arrow)
-    show_image(panels["after"], after.images[0], "After: image $I_{t+1}$")
-    masks, labels = answer.prediction.masks[0].reshape(*shape, -1), truth.labels[row]
-    show_image(panels["masks"], blend(image, masks[..., 1:]), "Predicted masks $m_t^k$ (Eq. 1)\na colour each")
-    numbers = np.arange(1, 1 + max(1, labels.max()))
-    moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(shape)])
-    show_image(panels["labels"], blend(image, moved.astype(float)), "True objects that moved\n(colours of their own)")
-    seen = valid.reshape(*shape, 1)
-    _draw_flows(panels, [("flow", "Predicted optical flow\n(U, V), Sec. III-C", answer.flow * seen),
-                         ("true_flow", "True optical flow\n(same colours)", true_pixels.reshape(*shape, 2) * seen)],
-                arrow[1])
-
-    shared, next_shared = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
-    warped, in_view = warp_backward(after.images, answer.flow[None])
-    show_image(panels["warped"], np.clip(warped[0], 0, 1),
-               "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
-    error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
-    error = np.ma.array(error, mask=~(shared.reshape(shape) & in_view[0]))
-    shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
-                       cmap=colormaps["magma"].with_extremes(bad="0.6"), vmin=0)
-    figure.colorbar(shown, ax=panels["error"], label="sum over R, G, B", **BELOW)
-
-    maps = distance_maps(answer.prediction.points, after.points, shared, next_shared)
-    distances, both = 100 * np.sqrt(maps), [panels["distance_predicted"], panels["distance_observed"]]
-    titles = "predicted to observed\n$D_{\\hat P \\to P}$", "observed to predicted\n$D_{P \\to \\hat P}$"
-    for axes, title, distance in zip(both, titles, distances):
-        shown = show_image(axes, distance.reshape(shape), f"Distance {title} (Eq. 2)", vmin=0, vmax=distances.max())
-    figure.colorbar(shown, ax=both, label="square root of D, cm", **BELOW)
-
+    _draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
+    _draw_losses(panels, answer)
     flows = [(true[valid], TRUE, 0.026, "true"),  # first and wider, so that both are seen where they agree
              ((answer.prediction.points[0] - points)[valid], PREDICTED, 0.013, "predicted")]
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], flows, start, poke[:2],
                      settings["arena"])
-    _draw_heatmaps(panels, [each.reshape(grid_shape(settings)) for each in answer.heatmaps], (start, poke[:2]),
-                   settings["arena"])
+    for which, symbol, heatmap, place in zip(("start", "end"), "AB", answer.heatmaps, (start, poke[:2])):
+        _draw_heatmap(panels[which], heatmap.reshape(grid_shape(settings)), place, settings["arena"], which, symbol)
     return figure
 
 
@@ -216,21 +209,18 @@ def training_figure(log):
     """How each loss term fell: one panel per term against the step, y logarithmic where all of it is positive.
 
     Paper: the terms of Eq. (6), before their weights.
-    log: list of dicts, one per epoch: "step", and each term by name (the mean over the epoch); "epoch" and
-    "learning_rate" are not drawn -> Figure.
-    Raises ValueError for an empty log, a term missing from an epoch, or a value that is not finite.
+    log: of `runs.train_saving`: dicts, one per epoch, of "step" and each term by name (the mean over the epoch);
+    "epoch" and "learning_rate" are not drawn -> Figure.
     """
-    names = [name for name in (log or [{}])[0] if name not in ("epoch", "step", "learning_rate")]
-    if not names or any(not {"step", *names} <= set(entry) for entry in log):
-        raise ValueError(f"log: expected one epoch or more, each with 'step' and the terms {names or '(any)'}")
-    values = {name: _checked(f"log: {name}", [entry[name] for entry in log], None) for name in ["step", *names]}
+    names = [name for name in log[0] if name not in ("epoch", "step", "learning_rate")]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(4 * columns, 2.8 * rows), dpi=100, layout="constrained")
     for i, name in enumerate(names):
         axes = figure.add_subplot(rows, columns, i + 1, label=name)
-        axes.plot(values["step"], values[name], ".-", color=PREDICTED, markersize=5, linewidth=1.5)
-        if (values[name] > 0).all():
+        values = [entry[name] for entry in log]
+        axes.plot([entry["step"] for entry in log], values, ".-", color=PREDICTED, markersize=5, linewidth=1.5)
+        if min(values) > 0:
             axes.set_yscale("log")
         axes.set(title=f"{name.replace('_', ' ')}\n{TERMS.get(name, '')}".strip(), xlabel="step")
         axes.grid(alpha=0.3)
@@ -239,85 +229,37 @@ def training_figure(log):
 
 # --- planning -----------------------------------------------------------------------------------------------------
 
-def arrows_of(pokes, settings, camera):
-    """Pokes (J, 3) as arrows of the shortest length: starts and targets, pixels (J, 2) each. Not in the paper."""
-    back = settings["poke_length"][0] * np.stack([np.cos(pokes[:, 2]), np.sin(pokes[:, 2])], axis=1)
-    return on_table(pokes[:, :2] - back, camera), on_table(pokes[:, :2], camera)
+def save_sequence(path, record, camera):
+    """An animation of executed pokes: marked points as rings, where they shall be as stars, the next poke, the goal.
 
-
-def _planning_panel(axes, picture, title, marks, goals, arrow):
-    """A picture with the marked points as rings, where they shall be as stars, a line from one to the other, and a poke
-    (start, target), all in px.
-    """
-    show_image(axes, picture, title)
-    for mark, goal in zip(marks, goals):
-        axes.plot(*np.transpose([mark, goal]), ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)
-    axes.plot(*np.transpose(marks), "o", markersize=9, fillstyle="none", color=GOAL, markeredgewidth=2,
-              path_effects=OUTLINE)
-    axes.plot(*np.transpose(goals), "*", markersize=11, color=GOAL, markeredgecolor="black")
-    if arrow is not None and np.isfinite(arrow).all():
-        draw_arrow(axes, *arrow)
-    axes.set(xlim=(-0.5, picture.shape[1] - 0.5), ylim=(picture.shape[0] - 0.5, -0.5))
-
-
-def population_figure(image, rounds, marks, goals):
-    """How CEM's population converges: a panel per round, every candidate's first poke as a line on the picture.
-
-    Paper: Sec. III-H. image (H, W, 3) in [0, 1]. rounds: a list of (starts (J, 2) px, targets (J, 2) px, costs (J,)),
-    the costs infinite for pokes that cannot be. marks, goals (M, 2) px -> Figure.
-    Raises ValueError for wrong shapes or no round.
-    """
-    image = _checked("image", image, None, None, 3, low=0, high=1)
-    if not rounds:
-        raise ValueError("rounds: expected at least one, got none")
-    marks, goals = _checked("marks", marks, None, 2), _checked("goals", goals, len(marks), 2)
-    finite = np.concatenate([np.asarray(costs)[np.isfinite(costs)] for *_, costs in rounds])
-    low, high = (finite.min(), np.quantile(finite, 0.9)) if len(finite) else (0, 1)
-    figure = Figure(figsize=(3.4 * len(rounds), 3.3), dpi=100, layout="constrained")
-    for i, (starts, targets, costs) in enumerate(rounds):
-        axes = figure.add_subplot(1, len(rounds), i + 1, label=f"round {i + 1}")
-        dear_first = [j for j in np.argsort(costs)[::-1] if np.isfinite(costs[j])]
-        _planning_panel(axes, 0.45 + 0.5 * image.mean(axis=2, keepdims=True).repeat(3, axis=2),
-                        f"Round {i + 1}: {len(dear_first)} of {len(costs)} possible\nlowest cost {np.min(costs):.2f}",
-                        marks, goals, (starts[dear_first[-1]], targets[dear_first[-1]]) if dear_first else None)
-        for j in dear_first:
-            colour = colormaps["cividis"](1 - np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1))
-            axes.plot(*np.transpose([starts[j], targets[j]]), color=colour, linewidth=1.2)
-            axes.plot(*targets[j], ".", color=colour, markersize=5)
-    figure.suptitle("CEM narrows its population down (yellow: cheap, blue: dear; arrow: the best of the round)",
-                    fontsize=12)
-    return figure
-
-
-def save_sequence(path, images, goal_image, arrows, marks, goals, distances):
-    """An animation of a planned sequence, written whole or not at all. Paper: Sec. IV-G, the figure of executed pokes.
-
-    images (T+1, H, W, 3) in [0, 1]; goal_image (H, W, 3) or None; arrows (T, 2, 2) px: start and target of each poke
-    (NaN: it could not be carried out); marks (T+1, M, 2) px; goals (M, 2) px; distances (T+1,) m: to the goals, mean.
-    Raises ValueError for other shapes. path: its name ends in .gif.
+    Paper: Sec. IV-G, its figure of a sequence. record: of `control.closed_loop`. path: its name ends in .gif; it is
+    written whole or not at all.
     """
     from matplotlib.animation import PillowWriter
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    images = _checked("images", images, None, None, None, 3, low=0, high=1)
-    goals = _checked("goals", goals, None, 2)
-    marks = _checked("marks", marks, len(images), len(goals), 2)
-    distances = _checked("distances", distances, len(images), low=0)
-    _checked("arrows", np.nan_to_num(arrows), len(images) - 1, 2, 2)
-    columns = 1 if goal_image is None else 2
+    marks, goals, last = project(record["marks"], camera), record["goal_marks"], len(record["pokes"])
+    distance = 100 * record["distance"].mean(axis=1)  # cm
+    arrows = on_table(np.stack([record["starts"], record["pokes"][:, :2]], axis=1), camera)
+    columns = 2 if "goal_rgb" in record else 1
     figure = Figure(figsize=(4.2 * columns, 3.7), dpi=80)
     figure.subplots_adjust(left=0.02, right=0.98, top=0.88, bottom=0.02, wspace=0.04)
-    FigureCanvasAgg(figure)
     writer = PillowWriter(fps=1)
     with whole_file(path) as temporary, writer.saving(figure, str(temporary), dpi=80):
-        for t, image in enumerate(images):
+        for t, image in enumerate(record["rgb"] / 255):
             figure.clear()
-            last = t == len(images) - 1
-            title = f"after {t} pokes: {100 * distances[t]:.1f} cm to go" + ("" if last else f"\nnext: poke {t + 1}")
-            _planning_panel(figure.add_subplot(1, columns, 1), image, title, marks[t], goals,
-                            None if last else arrows[t])
-            if goal_image is not None:
-                show_image(figure.add_subplot(1, columns, 2), goal_image, "goal\n")
-            for _ in range(2 if last else 1):
+            axes = figure.add_subplot(1, columns, 1)
+            title = f"after {t} pokes: {distance[t]:.1f} cm to go"
+            show_image(axes, image, title if t == last else f"{title}\nnext: poke {t + 1}")
+            for mark, goal in zip(marks[t], goals):
+                axes.plot(*np.transpose([mark, goal]), ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)
+            axes.plot(*marks[t].T, "o", markersize=9, fillstyle="none", color=GOAL, markeredgewidth=2,
+                      path_effects=OUTLINE)
+            axes.plot(*goals.T, "*", markersize=11, color=GOAL, markeredgecolor="black")
+            if t < last and np.isfinite(arrows[t]).all():  # else the finger found no room
+                draw_arrow(axes, *arrows[t])
+            axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
+            if columns == 2:
+                show_image(figure.add_subplot(1, 2, 2), record["goal_rgb"] / 255, "goal\n")
+            for _ in range(2 if t == last else 1):
                 writer.grab_frame()
 
 

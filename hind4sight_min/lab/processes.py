@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from threading import Thread
 
+from .. import check_whole
+
 
 def _begin_worker():
     """Leave an interrupt to the parent to handle, and end with it, however it ends: a worker that went on alone would
@@ -28,32 +30,24 @@ def worker_pool(jobs):
 
 
 @contextmanager
-def pool_map(jobs):
-    """A `map` for `collect` that spreads its calls over `jobs` processes; results come in order, as they are there."""
-    if jobs == 1:
-        yield map
-        return
-    with worker_pool(jobs) as pool:
-        try:
-            yield pool.map
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # what has not begun is left for the next call
-            raise
-
-
-@contextmanager
 def parallel_map(jobs):
-    """A `map` for `training.train` that spreads its calls over `jobs` processes, this one included; order is kept.
+    """A `map` that spreads its calls over `jobs` processes, this one included; results come in order, one by one.
 
     Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
+    Raises ValueError for a number of processes that cannot be.
     """
+    check_whole("jobs", jobs, 1)
     if jobs == 1:
         yield map
         return
-    with worker_pool(jobs - 1) as pool:
-        def parallel(function, *arguments):
-            calls = list(zip(*arguments))
-            given = {i: pool.submit(function, *call) for i, call in enumerate(calls) if i % jobs}
-            own = {i: function(*call) for i, call in enumerate(calls) if not i % jobs}
-            return [given[i].result() if i in given else own[i] for i in range(len(calls))]
+    pool = worker_pool(jobs - 1)
+
+    def parallel(function, *arguments):
+        calls = list(zip(*arguments))
+        given = {i: pool.submit(function, *call) for i, call in enumerate(calls) if i % jobs}
+        for i, call in enumerate(calls):
+            yield given[i].result() if i in given else function(*call)
+    try:
         yield parallel
+    finally:
+        pool.shutdown(cancel_futures=True)  # after an interrupt, what has not begun is left for the next call

@@ -2,7 +2,6 @@
 import time
 from pathlib import Path
 
-from .. import check_whole
 from ..disk.files import write_text
 from ..disk.checkpoints import save_run
 from ..training import CHUNK, learning_rate, train, unsupervised
@@ -17,7 +16,6 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     run.meta["seconds"]; so a run that was resumed has the log of one that was not. The log also goes beside `path`, as
     CSV. jobs: processes, on which the result does not depend. on_step(run, terms), on_epoch(entry): called after each.
     """
-    check_whole("jobs", jobs, 1)
     recipe, meta, per_epoch = run.recipe, run.meta, max(1, len(data) // run.recipe.batch)
     log, sums, before = meta.setdefault("log", []), meta.setdefault("sums", {}), meta.get("seconds", 0.0)
     began = saved = time.perf_counter()

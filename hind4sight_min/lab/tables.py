@@ -23,7 +23,7 @@ from ..sim.objects import HELD_OUT
 from ..sim.truth import load_truth
 from . import control, evaluation, image_pairs, se3nets
 from .noise import under_noise
-from .processes import pool_map, worker_pool
+from .processes import parallel_map, worker_pool
 from .runs import train_saving
 
 
@@ -178,37 +178,29 @@ def run_cell(cell, out, scale, save_every=60.0):
 
 # --- all of them ------------------------------------------------------------------------------------------------
 
-def run_all(function, tasks, jobs, report=None):
-    """{task: function(*task)} of tuples, over so many processes; report(done, task, result) is called after each."""
-    results = {}
+def run_all(function, tasks, jobs):
+    """(task, function(*task)) of tuples, in order, as they are there; over so many processes."""
+    check_whole("jobs", jobs, 1)
     with worker_pool(jobs) as pool:
         try:
-            for task, result in zip(tasks, pool.map(function, *zip(*tasks))):
-                results[task] = result
-                if report:
-                    report(len(results), task, result)
+            yield from zip(tasks, pool.map(function, *zip(*tasks)))
         except BaseException:  # an interrupt must not wait for what runs: its files are on disk
             pool.shutdown(wait=False, cancel_futures=True)
             for process in active_children():
                 process.terminate()
             raise
-    return results
 
 
 def reproduce(tables, out, scale, jobs=1, progress=None):
     """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
-    check_whole("jobs", jobs, 1)
-    out = Path(out)
-    with pool_map(jobs) as map:
+    with parallel_map(jobs) as map:
         collect_data(out, scale, map, progress)
-    cells = cells_of_tables(tables, scale)
-
-    def report(done, task, metrics):
-        print(f"{done} of {len(cells)}: {task[0].group}, seed {task[0].seed}: ratio {metrics['flow_mse_ratio']:.3f}, "
+    cells, results = cells_of_tables(tables, scale), {}
+    for (cell,), metrics in run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs):
+        results[cell] = metrics
+        print(f"{len(results)} of {len(cells)}: {cell.group}, seed {cell.seed}: ratio {metrics['flow_mse_ratio']:.3f}, "
               f"{metrics['train_seconds'] / 60:.1f} min", flush=True)
-
-    results = run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs, report)
-    figures = summarise({cell: results[cell,] for cell in cells}, scale)
+    figures = summarise(results, scale)
     if "optical-flow" in tables:
         figures.update(image_pairs.evaluate_image_pairs(**vars(_data(out / "test"))))
     return figures
@@ -311,10 +303,10 @@ def outcome(record):
     after every poke; others_shifted_m: the farthest that any other object was moved from its place; angles_deg: of
     movers that are not round, at first and at last.
     """
-    poses, distance, angles = record["poses"][..., :2], record["distance"].mean(axis=1), record["angle"][[0, -1]]
-    others = np.delete(poses, record["movers"], axis=1)
+    distance, angles = record["distance"].mean(axis=1), record["angle"][[0, -1]]
+    others = np.delete(record["poses"][..., :2], record["movers"], axis=1)
     return {"distance_m": np.pad(distance, (0, POKES + 1 - len(distance)), "edge").tolist(),  # it stopped: all stays
-            "others_shifted_m": float(np.linalg.norm(others - others[0], axis=2).max()), "pokes": len(record["pokes"]),
+            "others_shifted_m": float(np.linalg.norm(others - others[0], axis=2).max()),
             "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist()}
 
 
@@ -323,11 +315,10 @@ def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
 
     Scenes that were run before, with the same checkpoint and planners, are not run again.
     """
-    check_whole("jobs", jobs, 1)
     seeds = [seed for seed in range(scenes + 1) if seed != TRAIN_SEED][:scenes]
     todo = list(product(PLANNERS, OBJECTS, seeds, [0]))
     todo += product(("learned", "greedy"), [0], range(OBSTACLE_SCENES), range(OBSTACLE_TRIES))
-    return summarise_planning(run_all(partial(run_scene, checkpoint, Path(out)), todo, jobs))
+    return summarise_planning(dict(run_all(partial(run_scene, checkpoint, out), todo, jobs)))
 
 
 def summarise_planning(results):

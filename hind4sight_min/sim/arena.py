@@ -3,7 +3,6 @@
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
 import tempfile
-import time
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -55,8 +54,6 @@ class Settings:
                 check_whole(name, value, 1)
             elif kind is float and not 0 < value < float("inf"):
                 raise ValueError(f"{name}: expected a finite number > 0, got {value}")
-            elif isinstance(value, list):  # JSON has lists where we have tuples
-                object.__setattr__(self, name, tuple(value))
         cells, length = self.arena / self.cell, self.poke_length
         paths = isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena
         for good, name, expected in (
@@ -74,28 +71,17 @@ class Settings:
 
 # --- the camera ---------------------------------------------------------------------------------------------------
 
-def look_at(eye, target):
-    """Camera pose (4, 4) arena_from_camera at `eye`, looking at `target` (both (3,), m, arena), z up.
+def arena_camera(width, height):
+    """The fixed Camera: in front of the arena, looking down at 54 degrees; the same view at any size, in pixels.
 
-    Not in the paper: it only says that the camera is fixed.
-    Raises ValueError when it would look straight up or down, where "right" is not defined.
+    Not in the paper, which only says that the camera is fixed.
     """
-    eye, target = np.asarray(eye, float), np.asarray(target, float)
-    forward = target - eye
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    if not np.linalg.norm(right) > 1e-9:
-        raise ValueError(f"eye, target: expected two points not one above the other, got {eye}, {target}")
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    eye, target, right = np.array([0, -0.46, 0.62]), np.array([0, -0.018, 0]), np.array([1.0, 0, 0])
+    forward = (target - eye) / np.linalg.norm(target - eye)
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
-    return pose
-
-
-def arena_camera(width, height):
-    """The fixed Camera: in front of the arena, looking down at 54 degrees; the same view at any size, in pixels."""
     focal = height / 2 / np.tan(np.radians(34.5) / 2)
-    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
-                  look_at([0, -0.46, 0.62], [0, -0.018, 0]))
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, pose)
 
 
 # --- the arena ----------------------------------------------------------------------------------------------------
@@ -104,8 +90,8 @@ class Arena:
     """One Bullet world: a walled table, a finger on three prismatic joints, a camera. A context manager.
 
     Of the present scene's objects: bodies, Bullet's numbers; kinds; radii, how far their corners lie from the middle,
-    m. empty_depth (H, W) m: the arena without any. bullet: Bullet's functions, for this world; bullet_seconds: spent in
-    stepping and rendering. All is drawn from the Generator `rng`. Raises RuntimeError where pybullet is not installed.
+    m. empty_depth (H, W) m: the arena without any. bullet: Bullet's functions, for this world. All is drawn from the
+    Generator `rng`. Raises RuntimeError where pybullet is not installed.
     """
 
     def __init__(self, settings, rng):
@@ -118,7 +104,7 @@ class Arena:
         self.bullet = SimpleNamespace(**{name: partial(value, physicsClientId=world) if callable(value) else value
                                          for name, value in vars(pybullet).items()})
         self.settings, self.rng, self.camera = settings, rng, arena_camera(settings.width, settings.height)
-        self.bodies, self.kinds, self.radii, self.bullet_seconds = [], [], [], 0.0
+        self.bodies, self.kinds, self.radii = [], [], []
         self._build()
         self.empty_depth = self.observe()[1]
 
@@ -177,10 +163,8 @@ class Arena:
             p.setJointMotorControl2(self._finger, joint, p.POSITION_CONTROL, targetPosition=value, force=1000)
 
     def _step(self, count):
-        start, step = time.perf_counter(), self.bullet.stepSimulation
         for _ in range(count):
-            step()
-        self.bullet_seconds += time.perf_counter() - start
+            self.bullet.stepSimulation()
 
     def settle(self, limit=240):
         """Step until every object is at rest; False if one still moves after `limit` steps."""
@@ -250,21 +234,12 @@ class Arena:
         turned = p.multiplyTransforms([0, 0, 0], [0, 0, np.sin(turn / 2), np.cos(turn / 2)], [0, 0, 0], quaternion)[1]
         p.resetBasePositionAndOrientation(body, [*xy, position[2] + 0.001], turned)
 
-    def snapshot(self):
-        """The state of the world, for `restore`; Bullet keeps it until the arena is closed."""
-        return self.bullet.saveState()
-
-    def restore(self, state):
-        """Bring back the world of a `snapshot` of the same scene."""
-        self.bullet.restoreState(state)
-
     def observe(self):
         """Look at the arena -> rgb (H, W, 3) uint8, depth (H, W) float32 m, labels (H, W) uint8 (truth)."""
-        c, fine, start = self.camera, SUPERSAMPLE, time.perf_counter()
+        c, fine = self.camera, SUPERSAMPLE
         width, height, rgba, zbuffer, bodies = self.bullet.getCameraImage(
             fine * c.width, fine * c.height, self._view, self._projection, shadow=0, lightDirection=[0.3, -0.6, 1.0],
             renderer=self.bullet.ER_TINY_RENDERER)
-        self.bullet_seconds += time.perf_counter() - start
         rgb = np.reshape(rgba, (height, width, 4)).astype(np.uint8)[..., :3]
         rgb = cv2.resize(rgb, (c.width, c.height), interpolation=cv2.INTER_AREA)
         zbuffer, bodies = (np.reshape(each, (height, width))[fine // 2::fine, fine // 2::fine]

@@ -1,5 +1,4 @@
 """Collection: shards of pokes, each in a Bullet world with its own seed. Paper: Sec. IV-A and IV-B."""
-import time
 from collections import Counter
 from dataclasses import asdict
 from functools import partial
@@ -18,7 +17,7 @@ SHARD_POKES = 100  # one shard is one world, so the data do not depend on who co
 
 
 def collect_shard(settings, seed, index, pokes):
-    """Collect one shard -> (Interactions, Truth, seconds inside Bullet). The same arguments give the same data.
+    """Collect one shard -> (Interactions, Truth). The same arguments give the same data.
 
     Interactions are dropped, and counted in meta["counts"], when an object left the arena, is out of the camera's
     sight, or never came to rest. Raises ValueError for settings under which that is nearly always so.
@@ -47,7 +46,7 @@ def collect_shard(settings, seed, index, pokes):
     meta = plain({"seed": seed, "shard": index, "settings": asdict(settings), "counts": dict(counts)})
     interactions = Interactions(rgb_before, rgb_after, depth_before, depth_after, np.stack(drawn), np.stack(starts),
                                 arena.empty_depth, arena.camera, meta)
-    return interactions, Truth(labels, poses_before, poses_after), arena.bullet_seconds
+    return interactions, Truth(labels, poses_before, poses_after)
 
 
 def _outcome(before, after, count, at_rest, settings):
@@ -62,39 +61,35 @@ def _outcome(before, after, count, at_rest, settings):
 
 
 def _collect_file(settings, seed, job):
-    (index, path, pokes), start = job, time.perf_counter()
-    interactions, truth, inside = collect_shard(settings, seed, index, pokes)
+    index, path, pokes = job
+    interactions, truth = collect_shard(settings, seed, index, pokes)
     save_truth(path, truth)  # first, so that a shard never lacks its truth
     save_shard(path, interactions)
-    return interactions.meta["counts"], inside, time.perf_counter() - start
+    return interactions.meta["counts"]
 
 
 def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None):
     """Collect `pokes` interactions into `folder`; shards already there from the same call are kept.
 
     map: as Python's; that of a pool of processes collects several shards at a time. progress(done, total) is called
-    after every shard. Returns a dict: counts of kept and dropped pokes, seconds, and share_in_bullet, the share of the
-    shards' time spent inside Bullet's stepping and rendering (None if no shard was missing).
+    after every shard. Returns the counts of kept and dropped pokes, a dict.
     Raises ValueError for bad counts or a folder with other data in it.
     """
     check_whole("pokes", pokes, 1)
     check_whole("seed", seed, 0)
-    folder, began, counts = Path(folder), time.perf_counter(), Counter()
-    missing = {folder / f"shard_{first // SHARD_POKES:04d}.npz": min(SHARD_POKES, pokes - first)
-               for first in range(0, pokes, SHARD_POKES)}
-    jobs = {path: (index, path, size) for index, (path, size) in enumerate(missing.items())}
+    counts, jobs = Counter(), {}
+    for index, first in enumerate(range(0, pokes, SHARD_POKES)):
+        path = Path(folder) / f"shard_{index:04d}.npz"
+        jobs[path] = index, path, min(SHARD_POKES, pokes - first)
     for path in find_shards(folder):
-        old = load_shard(path)
-        if (old.meta["seed"], old.settings, len(old)) != (seed, plain(asdict(settings)), missing.get(path)):
+        old, (_, _, size) = load_shard(path), jobs.get(path, (None, None, 0))
+        if (old.meta["seed"], old.settings, len(old)) != (seed, plain(asdict(settings)), size):
             raise ValueError(f"{path}: holds data of another seed, other settings or another number of pokes")
         if truth_path(path).exists():
             counts.update(old.meta["counts"])
             del jobs[path]
-    done, inside, total = pokes - sum(size for *_, size in jobs.values()), 0.0, 0.0
-    for job, result in zip(jobs.values(), map(partial(_collect_file, settings, seed), jobs.values())):
-        counts.update(result[0])
-        inside, total, done = inside + result[1], total + result[2], done + job[2]
+    for made in map(partial(_collect_file, settings, seed), jobs.values()):
+        counts.update(made)
         if progress:
-            progress(done, pokes)
-    return {"counts": dict(counts), "seconds": time.perf_counter() - began,
-            "share_in_bullet": inside / total if total else None}
+            progress(counts["kept"], pokes)
+    return dict(counts)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..disk.files import load_npz, save_npz
 from ..disk.shards import FORMAT, load_shard, shards_in
@@ -25,15 +26,6 @@ class Truth:
         return Truth(self.labels[rows], self.poses_before[rows], self.poses_after[rows])
 
 
-def rotation_from_quaternion(quaternions):
-    """Unit quaternions (..., 4), (x, y, z, w) as in Bullet -> rotation matrices (..., 3, 3)."""
-    x, y, z, w = np.moveaxis(np.asarray(quaternions, float), -1, 0)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
-    return np.stack(rows, axis=-1).reshape(x.shape + (3, 3))
-
-
 def true_scene_flow(points, labels, pose_before, pose_after):
     """Scene flow of one interaction from the objects' poses. Paper: Sec. IV-C.
 
@@ -41,11 +33,10 @@ def true_scene_flow(points, labels, pose_before, pose_after):
     points (H, W, 3) m arena, labels (H, W), poses (7, 7) -> (H, W, 3) float32 m.
     """
     flow = np.zeros(points.shape, np.float32)
-    before, after = (rotation_from_quaternion(pose[:, 3:]) for pose in (pose_before, pose_after))
-    for index in np.unique(labels[labels > 0]) - 1:
-        here = labels == index + 1
-        local = (points[here] - pose_before[index, :3]) @ before[index]
-        flow[here] = local @ after[index].T + pose_after[index, :3] - points[here]
+    for label in np.unique(labels[labels > 0]):
+        here, before, after = labels == label, pose_before[label - 1], pose_after[label - 1]
+        local = Rotation.from_quat(before[3:]).inv().apply(points[here] - before[:3])
+        flow[here] = Rotation.from_quat(after[3:]).apply(local) + after[:3] - points[here]
     return flow
 
 
