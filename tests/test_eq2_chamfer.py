@@ -84,7 +84,7 @@ def test_nearest_squared_distances_match_brute_force(references, share):
     rng = np.random.default_rng(1)
     queries, references = rng.normal(size=(3, 20, 3)), rng.normal(size=(3, references, 3))
     queries[:, :6] = references[:, :6]  # points that never moved
-    queries[:, 3:6, 2] += 2  # or moved along one axis only
+    queries[:, 3:6] += 2 * np.eye(3)  # or moved along one axis only
     valid = rng.random(references.shape[:2]) < share
     expected = brute_force(queries, references, valid)
     assert_close(nearest_squared_distances(queries, references, valid), expected, "squared? only valid references?")
