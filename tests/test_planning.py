@@ -7,7 +7,7 @@ from tiny import SETTINGS, TINY, camera, random_run, tiny_pokes
 
 from hind4sight_min import planning
 from hind4sight_min.geometry import project
-from hind4sight_min.interactions import cell_centres, finger_fits, occupied_grid
+from hind4sight_min.interactions import cell_centres, occupied_grid
 from hind4sight_min.lab import evaluation
 from hind4sight_min.planning import Goal, Search, View, cem, draw_pokes, plan, planning_cost, possible_starts, roll
 from hind4sight_min.scene import Scene
@@ -101,12 +101,6 @@ def test_possible_starts_against_a_loop():
         assert np.isnan(row).all() if not len(options) else (row == options[0]).all()
 
 
-def test_the_finger_keeps_its_radius_from_a_wall():
-    places = np.array([[[0.0, 0.239], [0.0, 0.241], [-0.241, 0.1], [0.24999, 0.24999]]])
-    fits = finger_fits(places, np.zeros((1, 20, 20), bool), SETTINGS)
-    np.testing.assert_array_equal(fits, [[True, False, False, False]], err_msg="within the finger's radius of a wall")
-
-
 def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere():
     scene, _ = scenes_of(tiny_pokes(cam=CAMERA)[[3]])
     view = planning.view_of(scene, scene.points[0][:0])
@@ -120,9 +114,6 @@ def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere():
     starts = possible_starts(drawn[:, 0], np.repeat(grid, 300, axis=0), SETTINGS)
     assert np.isfinite(starts[..., 0]).any(axis=1).all()
     assert np.histogram(drawn[..., 1, 2], bins=6, range=(-np.pi, np.pi))[0].min() > 25
-
-
-def test_no_room_behind_any_object_is_said():
     x, y = np.meshgrid(np.arange(-0.24, 0.25, 0.02), np.arange(-0.24, 0.25, 0.02))
     full = island(marks=np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]))
     with pytest.raises(planning.NoPoke, match="no room for the finger"):
@@ -224,16 +215,6 @@ def test_cem_finds_the_minimum_of_a_bowl_where_a_part_is_forbidden():
     assert all(len(np.unique(population[1:, 0, 0])) > 90 for _, population, *_ in seen), "the spread collapses"
 
 
-def test_elites_of_infinite_cost_are_left_out():
-    population, means = first_population(4), []
-
-    def cost(sequences):  # three candidates are possible, and they lie together
-        return np.where(np.arange(len(sequences)) < 3, 1.0 + np.arange(len(sequences)), np.inf)
-    population[:3] = np.float32([[[0.1, 0.1, 0.5]], [[0.11, 0.1, 0.5]], [[0.12, 0.1, 0.5]]])
-    cem(cost, population, np.random.default_rng(3), Search(iterations=1), lambda *state: means.append(state[3]))
-    np.testing.assert_allclose(means[0], [[0.11, 0.1, 0.5]], rtol=1e-5)
-
-
 def test_cem_keeps_the_best_ever_and_begins_every_round_with_it():
     costs, rounds = [], []
 
@@ -247,17 +228,19 @@ def test_cem_keeps_the_best_ever_and_begins_every_round_with_it():
         np.testing.assert_array_equal(population[0], best)
 
 
-def test_nan_loses_and_where_nothing_is_possible_that_is_said():
-    population = first_population(4)
-    only = population[7].copy()
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+def test_what_is_impossible_is_no_elite_and_where_nothing_is_possible_that_is_said(bad):
+    population, means, rng = first_population(4), [], np.random.default_rng(3)
+    population[:3] = np.float32([[[0.1, 0.1, 0.5]], [[0.11, 0.1, 0.5]], [[0.12, 0.1, 0.5]]])
 
-    def cost(sequences):
-        return np.where((sequences == only).all(axis=(1, 2)), 1.0, np.nan)
-    best, lowest = cem(cost, population, np.random.default_rng(3), Search(iterations=3))
-    np.testing.assert_array_equal(best, only)
+    def cost(sequences):  # these three are possible
+        return np.where(np.arange(len(sequences)) < 3, 1.0 + np.arange(len(sequences)), bad)
+    best, lowest = cem(cost, population, rng, Search(iterations=1), lambda *state: means.append(state[3]))
+    np.testing.assert_allclose(means[0], [[0.11, 0.1, 0.5]], rtol=1e-5)
+    np.testing.assert_array_equal(best, population[0])
     assert lowest == 1
     with pytest.raises(planning.NoPoke, match="no candidate poke is possible"):
-        cem(lambda s: np.full(len(s), np.nan), population, np.random.default_rng(3), Search())
+        cem(lambda s: np.full(len(s), bad), population, rng, Search())
 
 
 @pytest.mark.parametrize("changes, named", [
