@@ -1,13 +1,11 @@
-"""Camera, rigid motions, projections and rotations, exactly: off-centre principal point, fx != fy, odd poses."""
+"""Camera, projections and the poke's frame, exactly: off-centre principal point, fx != fy, odd poses."""
 import cv2
 import numpy as np
 import pytest
-from autograd import grad, jacobian
 from helpers import assert_close
-from scipy.linalg import expm, expm_frechet
 from scipy.spatial.transform import Rotation
 
-from hind4sight_min.geometry import Camera, optical_flow, poke_axes, poke_frame, project, rigid, so3_exp, unproject
+from hind4sight_min.geometry import Camera, optical_flow, poke_axes, poke_frame, project, rigid, unproject
 
 WIDTH, HEIGHT = 7, 5  # not square, and fx != fy, so that swapped axes show
 FX, FY, CX, CY = 60.0, 70.0, 4.2, 1.3
@@ -79,32 +77,6 @@ def test_project_and_optical_flow_match_opencv():
     flow = optical_flow(points, predicted, camera)
     assert_close(flow, with_opencv(predicted) - with_opencv(points), "minus the flow?", atol=1e-7)
     assert np.abs(flow).min() > 0.01
-
-
-# --- so3_exp ------------------------------------------------------------------------------------------------------
-
-def hat(w):
-    """[w]x, of which [w]x v = w x v."""
-    return np.cross(np.eye(3), w)
-
-
-@pytest.mark.parametrize("dtype, atol, gradient_atol", [(np.float64, 1e-11, 1e-6), (np.float32, 2e-6, 3e-5)])
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-6, 1e-4, 1e-2, 0.7, np.pi - 1e-6, np.pi, 5.0, 2 * np.pi])
-def test_so3_exp_and_its_derivative_match_the_matrix_exponential(angle, dtype, atol, gradient_atol):
-    w = angle * np.array([2.0, -3.0, 6.0]) / 7
-    rotation, gradient = so3_exp(w.astype(dtype)), jacobian(so3_exp)(w.astype(dtype))
-    assert rotation.dtype == gradient.dtype == dtype
-    assert_close(rotation, expm(hat(w)), atol=atol)
-    for i, axis in enumerate(np.eye(3)):  # the derivative of expm at [w]x in the direction [e_i]x
-        assert_close(gradient[..., i], expm_frechet(hat(w), hat(axis), compute_expm=False), atol=gradient_atol)
-
-
-def test_small_rotations_keep_their_digits_in_float32():
-    for angle in (1e-4, 5e-3, 0.02, 0.1):
-        w = (angle * np.array([0.6, 0.8, 0])).astype(np.float32)  # R[0, 1] is (1 - cos t) / t^2 w_x w_y alone
-        assert_close(so3_exp(w)[0, 1], expm(hat(w.astype(float)))[0, 1], rtol=1e-4, atol=0)
-        gradient = grad(lambda w: so3_exp(w)[0, 1])
-        assert_close(gradient(w)[:2], gradient(w.astype(float))[:2], rtol=1e-4, atol=0)
 
 
 # --- the poke's frame ---------------------------------------------------------------------------------------------
