@@ -81,31 +81,6 @@ def test_arrays_and_header_come_back_as_they_were(path):
     assert [each.name for each in path.parent.iterdir()] == ["good.npz"]
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.01, 0.3, 0.6, 0.9, 0.99])
-def test_a_truncated_file_is_refused(path, kept):
-    raw = path.read_bytes()
-    path.write_bytes(raw[:int(kept * len(raw))])
-    assert_refused(path, "damaged or not one of our files")
-
-
-def test_a_damaged_bit_is_refused_or_harmless(path):
-    raw, refused = path.read_bytes(), 0
-    for position in range(0, len(raw), 5):
-        damaged = bytearray(raw)
-        damaged[position] ^= 1 << position % 8
-        path.write_bytes(damaged)
-        try:
-            found, meta = load_npz(path, FORMAT)
-        except ValueError as error:
-            assert str(path) in str(error)
-            refused += 1
-        else:  # a bit that nothing depends on, such as a date's, may pass, and a whole array be lost; no other numbers
-            assert meta == {"format": FORMAT, "note": [1, "two"]}
-            for name in set(found) & set(arrays()):
-                np.testing.assert_array_equal(found[name], arrays()[name])
-    assert refused > len(raw) / 5 / 2
-
-
 def test_a_damaged_header_cannot_shorten_an_array(path):
     np.savez(path, meta=np.array(json.dumps({"format": FORMAT})), **arrays())
     raw = path.read_bytes()
@@ -131,6 +106,8 @@ def single_array():
     (lambda path: path.unlink(), ["no such file"]),
     (lambda path: (path.unlink(), path.mkdir()), ["no such file"]),
     (lambda path: path.write_bytes(b""), ["damaged"]),
+    *[(lambda path, kept=kept: path.write_bytes(path.read_bytes()[:int(kept * path.stat().st_size)]), ["damaged"])
+      for kept in (0.01, 0.6, 0.99)],
     (lambda path: path.write_text("just some text\n" * 20), ["damaged"]),
     (lambda path: path.write_bytes(pickle.dumps({"a": Trap})), ["damaged"]),
     (lambda path: path.write_bytes(single_array()), ["damaged"]),
@@ -145,14 +122,6 @@ def test_other_files_are_refused_by_name_and_never_run(path, make, words):
     make(path)
     assert_refused(path, *words)
     assert Trap.sprung == []
-
-
-def test_lack_of_memory_is_not_called_damage(path, monkeypatch):
-    def loads(text):
-        raise MemoryError
-    monkeypatch.setattr(json, "loads", loads)
-    with pytest.raises(MemoryError):
-        load_npz(path, FORMAT)
 
 
 @pytest.mark.parametrize("equation", range(1, 7))
