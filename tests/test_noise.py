@@ -8,7 +8,7 @@ from scipy.stats import chisquare
 from tiny import TINY, camera, random_run, tiny_pokes
 
 from hind4sight_min import training
-from hind4sight_min.lab import evaluation, noise
+from hind4sight_min.lab import noise
 from hind4sight_min.lab.noise import add_depth_noise, associate_with_noise, smooth_depth, with_depth_noise
 
 
@@ -97,18 +97,6 @@ def test_every_step_and_every_chunk_has_noise_of_its_own(same_pictures):
     assert_noise_of_its_own(seen, same_pictures.depth_before[0], "steps, or chunks of a step,")
 
 
-def test_every_poke_of_an_evaluation_has_noise_of_its_own_and_always_the_same(same_pictures):
-    run, truth_depth = random_run(), same_pictures.depth_before[0]
-    empty = same_pictures.camera.camera_from_arena
-
-    def depth_seen(row):
-        points = evaluation.ask(run, same_pictures, row, depth_noise=0.01).before.points[0]
-        return (points @ empty[:3, :3].T + empty[:3, 3])[:, 2]
-    seen = [depth_seen(row) for row in range(12)]
-    assert_noise_of_its_own(seen, truth_depth, "the pokes of an evaluation")
-    np.testing.assert_array_equal(depth_seen(5), seen[5])
-
-
 def test_noisy_depth_is_smoothed_in_both_frames():
     data = tiny_pokes()
     seen = with_depth_noise(data, 0.01, np.random.default_rng(3))
@@ -132,15 +120,6 @@ def test_association_is_uniform_over_the_window(window):
     assert np.abs(down).max() == np.abs(right).max() == half, "a window of n pixels reaches (n - 1) / 2 to each side"
     counts = np.bincount(((down + half) * window + right + half).ravel(), minlength=window ** 2)
     assert chisquare(counts).pvalue > 1e-3
-
-
-def test_association_at_the_border_keeps_the_pixel_itself():
-    drawn = np.stack([associate_with_noise(np.ones((4, 6)), np.random.default_rng(seed), 3) for seed in range(400)])
-    # A pixel keeps itself when its draw is itself or falls outside: 6 of 9 in a corner, 4 of 9 at an edge.
-    for (v, u), neighbours, kept in (((0, 0), {0, 1, 6, 7}, 6 / 9), ((3, 5), {16, 17, 22, 23}, 6 / 9),
-                                     ((0, 2), {1, 2, 3, 7, 8, 9}, 4 / 9), ((2, 0), {6, 7, 12, 13, 18, 19}, 4 / 9)):
-        assert set(drawn[:, v, u]) == neighbours
-        assert np.mean(drawn[:, v, u] == 6 * v + u) == pytest.approx(kept, abs=0.1)  # four standard errors
 
 
 def test_association_crosses_no_edge_of_the_depth_and_no_missing_pixel():
