@@ -76,16 +76,6 @@ def test_the_model_looks_at_all_that_stands_out_near_the_end_of_the_poke_and_at_
     assert not look(nothing, data.pokes)[1].any() and look(nothing, data.pokes)[0].shape == (20, 1)
 
 
-def test_where_the_model_looks_does_not_depend_on_the_other_scenes():
-    data = tiny_pokes(count=6)
-    before, _ = scenes(data)
-    rows, seen = look(before, data.pokes)
-    for i in range(6):
-        alone = Scene(**{name: value[[i]] for name, value in vars(before).items()})
-        own_rows, own_seen = look(alone, data.pokes[[i]])
-        np.testing.assert_array_equal(own_rows[0, own_seen[0]], rows[i, seen[i]])
-
-
 def test_a_crop_is_the_part_of_the_picture_with_the_whole_box():
     data = tiny_pokes(cam=camera(64, 48, 77.0))
     data.depth_before[2, 20:22, 30] = 0

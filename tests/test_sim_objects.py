@@ -77,8 +77,3 @@ def test_textures_have_two_colours_that_a_small_picture_can_show(name):
         assert small.reshape(-1, 3).std(axis=0).max() > 10
     np.testing.assert_array_equal(objects.draw_texture(name, np.random.default_rng(7)), pictures[7])
     assert len({picture.tobytes() for picture in pictures}) == 30
-
-
-def test_an_unknown_texture_is_refused():
-    with pytest.raises(ValueError, match="texture: .*'marble'"):
-        objects.draw_texture("marble", np.random.default_rng(0))
