@@ -2,17 +2,13 @@
 import re
 
 import autograd.numpy as anp
-import cv2
 import numpy as np
 import pytest
 from autograd import elementwise_grad, grad
 from helpers import assert_close, assert_float32, assert_gradient, gradient_of
-from scipy.ndimage import map_coordinates
 
 from hind4sight_min.ops import (LEAK, at_rows, bilinear_sample, dense, max_over_points, nearest_squared_distances,
                                 put_rows, take, unflatten)
-
-OPENCV_IS_EXACT = int(cv2.__version__.split(".")[0]) >= 5  # for float32 pictures of 1, 3 or 4 channels
 
 
 # --- nearest neighbours -------------------------------------------------------------------------------------------
@@ -37,26 +33,6 @@ def test_nearest_squared_distances_refuse_other_shapes(queries, references, vali
 
 # --- bilinear sampling --------------------------------------------------------------------------------------------
 
-def interpolated(images, positions):
-    """SciPy's linear interpolation with the border repeated."""
-    return np.stack([np.stack([map_coordinates(image[..., c].astype(float), [xy[..., 1], xy[..., 0]], order=1,
-                                               mode="nearest") for c in range(image.shape[2])], axis=-1)
-                     for image, xy in zip(images, positions)])
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
-def test_which_pictures_opencv_samples_exactly_and_which_it_rounds_to_1_32_px(dtype, channels):
-    rng = np.random.default_rng(2)
-    images, positions = rng.random((2, 5, 7, channels)).astype(dtype), rng.uniform(-2, 8, (2, 3, 20, 2)).astype(dtype)
-    found = bilinear_sample(images, positions)
-    exact = OPENCV_IS_EXACT and dtype == np.float32 and channels in (1, 3, 4)
-    assert found.dtype == dtype
-    assert_close(found, interpolated(images, positions), rtol=0, atol=1e-5 if exact else 1 / 32)  # 1/64 in x, in y
-    on_the_grid = np.round(positions * 32) / 32
-    assert_close(bilinear_sample(images, on_the_grid), interpolated(images, on_the_grid), rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("position, step", [((2, 1), (1, 1)), ((0, 0), (1, 1)), ((6, 4), (-1, -1)),
                                             ((6, 2), (-1, 1)), ((3, 4), (1, -1))])
 def test_on_a_whole_pixel_the_gradient_is_that_of_a_cell_beside_it(position, step):
@@ -68,19 +44,6 @@ def test_on_a_whole_pixel_the_gradient_is_that_of_a_cell_beside_it(position, ste
         slope = step[axis] * (bilinear_sample(images, moved) - bilinear_sample(images, positions))
         assert_close(found[axis], slope[0, 0, 0, 0], atol=1e-5)
         assert abs(found[axis]) > 0.01
-
-
-@pytest.mark.parametrize("height, width", [(4, 1), (1, 5), (1, 1)])
-def test_pictures_one_pixel_wide_or_high(height, width):
-    rng = np.random.default_rng(5)
-    images = rng.random((2, height, width, 3))
-    positions = rng.integers(-1, 5, (2, 3, 4, 2)) + rng.integers(2, 31, (2, 3, 4, 2)) / 32
-    assert_close(bilinear_sample(images, positions), interpolated(images, positions), rtol=0, atol=1e-6)
-    if height * width > 1:
-        found, _ = assert_gradient(bilinear_sample, 1, images, positions, step=1 / 32, atol=1e-5)
-    else:
-        found = elementwise_grad(bilinear_sample, 1)(images, positions)
-    assert bool(found[..., 0].any()) is (width > 1) and bool(found[..., 1].any()) is (height > 1)
 
 
 @pytest.mark.parametrize("images, positions", [
