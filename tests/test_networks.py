@@ -7,9 +7,8 @@ from tiny import SIZES, random_run, tiny_pokes
 
 from hind4sight_min import networks
 from hind4sight_min.geometry import poke_axes, poke_frame
-from hind4sight_min.networks import (encode, encoder_features, first_met, forward_model, fourier, height_map,
-                                     init_parameters, inverse_model, poke_features, pooling_weights, predict, softmax,
-                                     state_embedding)
+from hind4sight_min.networks import (encode, first_met, forward_model, height_map, init_parameters, inverse_model,
+                                     pooling_weights, predict, softmax, state_embedding)
 from hind4sight_min.scene import look
 from hind4sight_min.training import scenes_of
 
@@ -78,18 +77,6 @@ def test_the_forward_model_turns_with_the_arena_except_for_its_arena_features():
     after = forward_model(params, SIZES, points @ turn[0].T, valid, turned_pokes)
     np.testing.assert_allclose(after.points, before.points @ turn[0].T, atol=1e-10)
     np.testing.assert_allclose(after.masks, before.masks, atol=1e-10)
-
-
-def test_points_that_do_not_count_do_not_change_the_others():
-    rng = np.random.default_rng(4)
-    points, valid, pokes = cloud(rng)
-    params = random_parameters(rng)
-    valid[:, :10] = False
-    first = forward_model(params, SIZES, points, valid, pokes)
-    points[:, :10] = rng.uniform(-1, 1, (2, 10, 3))
-    second = forward_model(params, SIZES, points, valid, pokes)
-    np.testing.assert_allclose(second.points[:, 10:], first.points[:, 10:], atol=1e-12)
-    np.testing.assert_allclose(second.masks[:, 10:], first.masks[:, 10:], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", sorted(init_parameters(SIZES, np.random.default_rng(0))))
@@ -176,22 +163,6 @@ def test_the_inverse_model_gives_the_start_first_and_then_the_end():
     again, shifted = inverse_model(params, *seen, cells)
     np.testing.assert_allclose(again, start, err_msg="the two maps are swapped")
     np.testing.assert_allclose(shifted, end + 5)
-
-
-def test_fourier_against_numpy():
-    x = np.array([[0.03, -0.11]])
-    expected = [f(2 * np.pi * v / w) for f in (np.sin, np.cos) for v in x[0] for w in (0.4, 0.1)]
-    np.testing.assert_allclose(fourier(x, (0.4, 0.1))[0], expected)
-
-
-@pytest.mark.parametrize("features, unit", [(encoder_features, 0.25), (poke_features, 0.1)])
-def test_position_features_tell_the_table_from_what_stands_on_it(features, unit):
-    points = np.array([[0.05, -0.02, 0.0], [0.05, -0.02, 0.01]], np.float32)
-    found = features(points)
-    assert found.shape == (2, 20) and found.dtype == np.float32
-    np.testing.assert_allclose(found[:, :3], points / unit, rtol=1e-6)
-    np.testing.assert_allclose(found[:, 3], [0, np.tanh(1.0)], rtol=1e-6)
-    np.testing.assert_array_equal(found[0, 4:], found[1, 4:])  # the waves are of x and y alone
 
 
 def test_the_height_map_against_a_loop_over_points():
