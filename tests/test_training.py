@@ -1,6 +1,5 @@
 """Batches, the loss of Eq. (6), the optimisers, the loop, checkpoints."""
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -102,9 +101,10 @@ def gradient_of(run, batch, data, weights, vector=None):
 @pytest.mark.parametrize("name", [name for name in WEIGHTS if name != "photometric"])
 def test_the_gradient_of_every_term_against_finite_differences(name, monkeypatch):
     # The photometric term has finite differences of its own in test_eq3: cv2.remap rounds float64 positions.
-    monkeypatch.setattr(networks, "STATE_GAIN", 0.0)  # L_sim's gradient is cut at the encoder: the next test
     data, run = tiny_pokes(), random_run()
     batch, vector = doubled(make_batch(data, TINY, RNG(0))), run.vector.astype(float)
+    fixed = unflatten(vector, run.layout)  # of L_sim: its gradient stops at the encoder that compares
+    monkeypatch.setattr(training, "state_embedding", lambda params, *given: networks.state_embedding(fixed, *given))
     value, gradient = gradient_of(run, batch, data, {name: 1.0}, vector)
     direction, step = RNG(1).standard_normal(vector.shape), 1e-7
     values = [gradient_of(run, batch, data, {name: 1.0}, vector + sign * step * direction)[0] for sign in (1, -1)]
@@ -113,38 +113,12 @@ def test_the_gradient_of_every_term_against_finite_differences(name, monkeypatch
     np.testing.assert_allclose(gradient @ direction, expected, rtol=2e-3)
 
 
-def test_the_gradient_of_l_sim_reaches_masks_and_motions_and_stops_at_the_encoder_that_compares():
-    data, run = tiny_pokes(), random_run()
-    batch, vector = doubled(make_batch(data, TINY, RNG(0))), run.vector.astype(float)
-    fixed = unflatten(vector, run.layout)  # the encoder that compares
-    rows, next_rows = (look(scene, batch.pokes)[0] for scene in (batch.before, batch.after))
-
-    def embedded(points, scene, rows):
-        pick = np.arange(len(rows))[:, None], rows
-        return networks.state_embedding(fixed, points[pick], scene.occupied[pick])
-
-    def similarity(vector):
-        predicted = networks.predict(unflatten(vector, run.layout), SIZES, batch.before, batch.pokes).points
-        return losses.embedding_loss(embedded(predicted, batch.before, rows),
-                                     embedded(batch.after.points, batch.after, next_rows)).mean()
-    direction, step = RNG(1).standard_normal(vector.shape), 1e-7
-    expected = (similarity(vector + step * direction) - similarity(vector - step * direction)) / (2 * step)
-    found = grad(similarity)(vector)
-    assert abs(expected) > 1e-2
-    np.testing.assert_allclose(found @ direction, expected, rtol=2e-3)
-    whole = gradient_of(run, batch, data, {"inverse": 1.0}, vector)[1]
-    for name in ("mask_w", "motion_1_w"):  # nothing else of L_inv reaches them
-        np.testing.assert_allclose(*(unflatten(each, run.layout)[name] for each in (whole, found)), rtol=1e-6)
-
-
 @pytest.mark.parametrize("name", WEIGHTS)
-def test_every_term_reaches_masks_motions_and_encoder(name):
+def test_every_term_reaches_masks_motions_and_encoder_in_float32(name):
     data, run = tiny_pokes(), random_run()
     parts = unflatten(gradient_of(run, make_batch(data, TINY, RNG(0)), data, {name: 1.0})[1], run.layout)
-    assert parts["mask_w"].dtype == np.float32, "a derivative turned float32 into float64"
     for reached in ("encoder_1_w", "mask_w", "motion_1_w"):
-        assert np.abs(parts[reached]).max() > 0, reached
-    assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
+        assert np.abs(parts[reached]).max() > 0 and parts[reached].dtype == np.float32, reached
 
 
 # --- optimisers ---------------------------------------------------------------------------------------------------
@@ -258,30 +232,16 @@ def test_the_gradient_of_a_batch_is_that_of_its_chunks_and_a_map_may_spread_them
         assert parts[name] == pytest.approx(terms[name], rel=1e-3, abs=1e-5), name
 
 
-def test_another_objective_and_a_weight_of_nothing():
-    data = tiny_pokes()
-
-    def pull(params, recipe, interactions, rng, by):  # |mask_b - by|^2 has its minimum where it says
-        return {"pull": ((params["mask_b"] - by) ** 2).sum() * np.ones(len(interactions))}
-    run = start_run(replace(TINY, steps=200, learning_rate=0.05, weights={"pull": 1.0}), data)
-    train(data, run, partial(pull, by=0.5))
-    np.testing.assert_allclose(run.params["mask_b"], 0.5, atol=0.05)
-    one, two = (train(data, start_run(replace(TINY, steps=1, weights=weights), data)) for weights in
-                ({"chamfer": 1e3}, dict.fromkeys(WEIGHTS, 0.0) | {"chamfer": 1e3}))
-    np.testing.assert_array_equal(one.vector, two.vector, err_msg="a missing weight is 0")
-
-
 def test_a_gradient_that_is_not_finite_stops_the_run_and_leaves_it_as_it_was():
     data, run = tiny_pokes(), random_run(replace(TINY, weights={"chamfer": 1.0}))
 
     def broken(params, recipe, interactions, rng):
         return {"chamfer": np.ones(len(interactions)) * (params["mask_b"] * np.inf).sum()}
-    before = [run.vector.copy(), run.first_moment.copy(), run.second_moment.copy()]
+    before = run.vector.copy()
     with pytest.raises(FloatingPointError, match="step 0"), np.errstate(invalid="ignore"):
         train(data, run, broken)
-    for old, new in zip(before, (run.vector, run.first_moment, run.second_moment)):
-        np.testing.assert_array_equal(old, new)
-    assert run.step == 0
+    np.testing.assert_array_equal(run.vector, before)
+    assert run.step == 0 and not run.first_moment.any() and not run.second_moment.any()
 
 
 # --- checkpoints --------------------------------------------------------------------------------------------------
