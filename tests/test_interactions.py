@@ -1,5 +1,4 @@
 """The record of a poke, shards on disk, the arena's cells."""
-import json
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -101,21 +100,16 @@ def test_a_shard_comes_back_as_it_was(tmp_path):
     for name, value in asdict(saved.camera).items():
         np.testing.assert_array_equal(getattr(loaded.camera, name), value)
     assert {name: loaded.meta[name] for name in saved.meta} == saved.meta and loaded.meta["format"] == FORMAT
-    save_shard(tmp_path / "again.npz", loaded)
-    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
-    assert sorted(each.name for each in path.parent.iterdir()) == ["shard_0000.npz"]
 
 
-def test_a_shard_holds_what_its_documentation_says_without_our_code(tmp_path):
+def test_a_shard_holds_counts_of_a_tenth_of_a_millimetre_without_our_code(tmp_path):
     saved = pokes_with_holes()
     saved.depth_before[0, 0, 0] = 7.0  # 70,000 counts; modulo 2^16 it would come back as 0.4464 m
     save_shard(tmp_path / "shard_0000.npz", saved)
     with np.load(tmp_path / "shard_0000.npz") as archive:
-        counts, meta = archive["depth_before"], json.loads(str(archive["meta"]))
+        counts = archive["depth_before"]
     assert counts.dtype == np.uint16 and counts[0, 0, 0] == 65535
     np.testing.assert_array_equal(counts[1:], np.rint(saved.depth_before[1:] * 1e4))
-    assert meta["units"]["depth"] == 1e-4
-    assert meta["camera"]["arena_from_camera"] == saved.camera.arena_from_camera.tolist()
 
 
 def rewrite(path, arrays={}, meta={}, without=()):
@@ -127,14 +121,10 @@ def rewrite(path, arrays={}, meta={}, without=()):
 
 @pytest.mark.parametrize("changes, said", [
     ({"meta": {"format": "hind4sight_min interactions 0"}}, "expected format"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": np.eye(4).tolist(), "fx": 0.0}}}, "fx, fy > 0"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": np.eye(4).tolist(), "width": 17}}}, "shape"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": (2 * np.eye(4)).tolist()}}}, "rigid"),
-    ({"arrays": {"pokes": np.zeros((7, 2), np.float32)}}, "pokes: expected shape"),
+    ({"meta": {"camera": {**camera().plain, "fx": 0.0}}}, "fx, fy > 0"),
     ({"arrays": {"starts": np.full((7, 2), np.nan, np.float32)}}, "starts: expected finite"),
-    ({"arrays": {"labels": np.zeros(3)}}, "labels"), ({"without": ["pokes"]}, "pokes"),
-    ({"without": ["empty_depth"]}, "empty_depth"), ({"without": ["units"]}, "units"),
-    ({"without": ["camera"]}, "camera"), ({"without": ["settings"]}, "settings")])
+    ({"arrays": {"labels": np.zeros(3)}}, "labels"),
+    *[({"without": [name]}, name) for name in ("pokes", "empty_depth", "units", "camera", "settings")]])
 def test_a_shard_with_wrong_contents_names_file_and_field(tmp_path, changes, said):
     path = tmp_path / "shard_0000.npz"
     save_shard(path, tiny_pokes())
