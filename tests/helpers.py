@@ -72,3 +72,9 @@ def loop_smoothness(field, images, valid):
                 edge = np.abs(images[b, y2, x2] - images[b, y, x]).mean()
                 total[b] += np.abs(field[b, y2, x2] - field[b, y, x]).sum() * np.exp(-40 * edge)
     return total
+
+
+def inside_outline(points, outline, margin=0.0):
+    """Which points (..., 2) lie inside a convex counter-clockwise outline grown by `margin` m at every edge."""
+    edges, away = np.roll(outline, -1, axis=0) - outline, points[..., None, :] - outline
+    return ((edges[:, 0] * away[..., 1] - edges[:, 1] * away[..., 0]) / np.hypot(*edges.T) >= -margin).all(axis=-1)
