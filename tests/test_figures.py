@@ -4,8 +4,8 @@ from functools import cache
 import numpy as np
 import pytest
 from matplotlib.animation import PillowWriter
-from matplotlib.figure import Figure
 from PIL import Image
+from tiny import still_truth
 
 from hind4sight_min import training
 from hind4sight_min.geometry import Camera
@@ -13,7 +13,6 @@ from hind4sight_min.interactions import Interactions
 from hind4sight_min.lab import figures
 from hind4sight_min.lab.evaluation import Answer
 from hind4sight_min.networks import Prediction
-from hind4sight_min.sim.truth import Truth
 
 H, W, ARENA = 6, 8, 0.5
 BLOCK = np.zeros((H, W), bool)
@@ -44,11 +43,9 @@ def example(flow=(1.0, 0.0), missing=(), moves=1.0):
     prediction = Prediction(before.points + moving * SHIFT, masks, None, None)
     heatmaps = tuple(rng.random((2, 16)))
     answer = Answer(before, after, prediction, (BLOCK[..., None] * np.float32(flow)).astype(np.float32), heatmaps)
-    poses = np.zeros((1, 7, 7), np.float32)
-    poses[..., 6] = 1
-    poses_after = poses.copy()
-    poses_after[0, 1, :3] = moves * TRUE_SHIFT
-    return data, 0, answer, Truth(2 * BLOCK[None].astype(np.uint8), poses, poses_after)
+    truth = still_truth(2 * BLOCK[None])
+    truth.poses_after[0, 1, :3] = moves * TRUE_SHIFT
+    return data, 0, answer, truth
 
 
 def panels(figure):
@@ -104,20 +101,12 @@ def test_panels_draw_what_they_say():
     for name, distance in (("distance_predicted", apart[:, next_kept].min(axis=1) * kept),
                            ("distance_observed", apart[kept].min(axis=0) * next_kept)):
         np.testing.assert_allclose(picture(drawn[name]).ravel(), distance, atol=1e-4)
+    pixels = 10 / 0.46 * TRUE_SHIFT[:2] * [1, -1]  # of the true shift; y is up on the table, down in the picture
+    for name, flow in (("flow", [1.0, 0.0]), ("true_flow", pixels)):
+        expected = figures.flow_to_rgb(BLOCK[..., None] * flow, max(1, np.linalg.norm(pixels)))  # on one scale
+        np.testing.assert_allclose(picture(drawn[name]), expected, atol=1e-5)
     for name, heatmap in zip(("start", "end"), answer.heatmaps):
         assert np.array_equal(picture(drawn[name]), heatmap.reshape(4, 4))
-
-
-def test_flows_share_a_scale_and_show_only_what_has_depth():
-    given = example(flow=(3.0, 4.0), missing=[(2, 4)])
-    drawn = panels(figures.interaction_figure(*given))
-    seen = BLOCK.copy()
-    seen[2, 4] = False
-    np.testing.assert_allclose(picture(drawn["flow"]), figures.flow_to_rgb(seen[..., None] * [3.0, 4.0], 5.0))
-    pixels = 10 / 0.46 * np.array([0.02, -0.03])  # of the true shift; y is up on the table, down in the picture
-    np.testing.assert_allclose(picture(drawn["true_flow"]), figures.flow_to_rgb(seen[..., None] * pixels, 5.0),
-                               atol=1e-5)
-    assert "5.0 px" in drawn["flow"].texts[0].get_text()
 
 
 def test_masks_and_true_objects_are_coloured_over_grey():
@@ -135,19 +124,13 @@ def test_nothing_moves_and_hardly_anything_has_depth():
 
 
 def test_arrows_are_the_horizontal_motion_of_moved_points():
-    data, answer, drawn = drawn_example()
-    axes = drawn["scene_flow"]
+    _, answer, drawn = drawn_example()
     points = answer.before.points[0][BLOCK.ravel()]
-    true, predicted = [arrows for arrows in axes.collections if hasattr(arrows, "U")]
-    for arrows, flow in ((true, TRUE_SHIFT), (predicted, SHIFT)):
+    true, predicted = [arrows for arrows in drawn["scene_flow"].collections if hasattr(arrows, "U")]
+    for arrows, flow, colour in ((true, TRUE_SHIFT, figures.TRUE), (predicted, SHIFT, figures.PREDICTED)):
         np.testing.assert_allclose(arrows.get_offsets(), points[:, :2])
         np.testing.assert_allclose(np.stack([arrows.U, arrows.V], axis=-1), np.tile(flow[:2], (6, 1)), atol=1e-6)
-        assert arrows.scale == 1 and arrows.angles == "xy"
-        colour = figures.TRUE if arrows is true else figures.PREDICTED
         np.testing.assert_allclose(arrows.get_facecolor()[0, :3], colour, err_msg="true and predicted swapped?")
-    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    for place in (data.starts[0], data.pokes[0, :2], *(points + SHIFT)[:, :2]):
-        assert (place > low).all() and (place < high).all()
 
 
 def test_the_poke_and_the_true_cells_are_marked():
@@ -248,18 +231,13 @@ def test_save_sequence_names_what_does_not_fit(tmp_path, name, wrong):
     assert not list(tmp_path.iterdir())
 
 
-def test_control_figure_draws_boxes_and_means():
-    rng = np.random.default_rng(2)
-    curves = {(planner, objects): rng.random((6, 4)) * 0.1 for planner in ("learned", "oracle") for objects in (1, 2)}
-    figure = figures.control_figure(curves, 3)
-    assert [axes.get_label() for axes in figure.axes] == ["objects 1", "objects 2"]
-    for axes, objects in zip(figure.axes, (1, 2)):
+def test_control_figure_draws_the_mean_of_every_planner():
+    curves = {(planner, objects): np.random.default_rng(objects).random((6, 4)) * 0.1 * len(planner)
+              for planner in ("learned", "oracle") for objects in (1, 2)}
+    for axes, objects in zip(figures.control_figure(curves, 3).axes, (1, 2), strict=True):
         lines = {line.get_label(): line.get_ydata() for line in axes.lines}
         for planner in ("learned", "oracle"):
             np.testing.assert_allclose(lines[figures.STYLES[planner][0]], 100 * curves[planner, objects].mean(axis=0))
-        medians = [line.get_ydata()[0] for line in axes.lines if line.get_color() is figures.PREDICTED
-                   and len(line.get_xdata()) == 2 and np.ptp(line.get_ydata()) == 0]
-        np.testing.assert_allclose(medians, 100 * np.median(curves["learned", objects], axis=0))
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -272,16 +250,3 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path):
     assert first == again and first.startswith(b"\x89PNG") and b"Software" not in first
     with pytest.raises(ValueError, match="^path: expected"):
         figures.save_figure(figure, tmp_path / "a.pdf")
-
-
-@pytest.mark.parametrize("name, write, where, method", [
-    ("a.png", lambda path: figures.save_figure(Figure(), path), Figure, "savefig"),
-    ("a.gif", sequence, PillowWriter, "finish")])
-def test_a_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, name, write, where, method):
-    def full_disk(*_, **__):
-        raise OSError("disk full")
-    (tmp_path / name).write_bytes(b"old")
-    monkeypatch.setattr(where, method, full_disk)
-    with pytest.raises(OSError, match="disk full"):
-        write(tmp_path / name)
-    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [(name, b"old")]
