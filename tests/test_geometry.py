@@ -28,8 +28,6 @@ def cloud(*shape):
     return np.random.default_rng(0).uniform(-0.2, 0.2, shape + (3,))
 
 
-# --- Camera -------------------------------------------------------------------------------------------------------
-
 @pytest.mark.parametrize("changed, named", [
     (dict(width=0), "image size.*0 x 5"), (dict(height=-3), "image size.*7 x -3"), (dict(width=7.5), "image size"),
     (dict(fx=0.0), "intrinsics"), (dict(fy=-60.0), "intrinsics"), (dict(cx=np.nan), "intrinsics"),
@@ -49,8 +47,6 @@ def test_pixel_size_at_the_arenas_origin():
     assert_close(project(np.array([[0.0, 0, 0], [down.pixel_size, 0, 0]]), down), [[0.0, 0], [1, 0]], "not a pixel")
     assert make_camera().pixel_size == pytest.approx(0.62 ** 0.5 / FX)  # |(0.1, -0.6, 0.5)|
 
-
-# --- unproject, project -------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("function, argument, named", [
     (rigid, np.array([[0, 0, 1]]), "points: expected floating-point metres, got int64"),
@@ -78,8 +74,6 @@ def test_project_and_optical_flow_match_opencv():
     assert_close(flow, with_opencv(predicted) - with_opencv(points), "minus the flow?", atol=1e-7)
     assert np.abs(flow).min() > 0.01
 
-
-# --- the poke's frame ---------------------------------------------------------------------------------------------
 
 def test_poke_frame_by_hand_and_back():
     pokes = np.array([[0.1, 0.2, np.pi / 2], [0.0, -0.1, 0.3]])  # the first pushes along the arena's y
