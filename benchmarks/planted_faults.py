@@ -46,7 +46,7 @@ PLANTED = (
         ("turned into the poke's frame before it is shifted", "np.matmul(points - origins[:, None], axes)",
          "np.matmul(points, axes) - origins[:, None]")]),
 
-    ("ops.py", "ops", [
+    ("ops.py", "ops eq3_photometric", [
         ("a query sits on a reference that does not count", "found = valid & np.logical_and", "found = np.logical_and"),
         ("number among the valid references taken for that among all",
          "rows[tree.query(q[i, asked], workers=threads)[1]]", "tree.query(q[i, asked], workers=threads)[1]"),

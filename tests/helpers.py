@@ -61,3 +61,20 @@ def assert_float32(function, argnum, *args, atol=1e-4):
     assert value.dtype == found.dtype == np.float32, f"float32 became {value.dtype}, its gradient {found.dtype}"
     assert_close(value, exact, "float32 against float64", rtol=1e-4, atol=atol)
     assert_close(found, gradient_of(function, argnum, weights, *args), "float32's gradient", rtol=1e-4, atol=atol)
+
+
+def loop_smoothness(field, images, valid):
+    """Eq. (4) and (5) neighbour by neighbour: field (B, H, W, D), images (B, H, W, 3), valid (B, H W) bool -> (B,)."""
+    total, valid = np.zeros(len(field)), valid.reshape(field.shape[:3])
+    for b, y, x in np.ndindex(field.shape[:3]):
+        for y2, x2 in ((y, x + 1), (y + 1, x)):
+            if y2 < field.shape[1] and x2 < field.shape[2] and valid[b, y, x] and valid[b, y2, x2]:
+                edge = np.abs(images[b, y2, x2] - images[b, y, x]).mean()
+                total[b] += np.abs(field[b, y2, x2] - field[b, y, x]).sum() * np.exp(-40 * edge)
+    return total
+
+
+def inside_outline(points, outline, margin=0.0):
+    """Which points (..., 2) lie inside a convex counter-clockwise outline grown by `margin` m at every edge."""
+    edges, away = np.roll(outline, -1, axis=0) - outline, points[..., None, :] - outline
+    return ((edges[:, 0] * away[..., 1] - edges[:, 1] * away[..., 0]) / np.hypot(*edges.T) >= -margin).all(axis=-1)

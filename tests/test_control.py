@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("pybullet")
 
+from scipy.spatial.transform import Rotation
 from test_planning import CAMERA, island
 from tiny import SETTINGS
 
@@ -91,11 +92,9 @@ def test_an_obstacle_stands_across_half_of_the_way_and_is_marked_to_stay():
 def test_distances_against_a_turn_by_hand(task):
     mover, kinds = task.movers[0], list(task.arena.kinds)
     task.arena.kinds[mover] = "carton"
-    poses, half = task.goal_poses.copy(), 0.3 / 2
-    x, y, z, w = poses[mover, 3:]
-    turn = [np.cos(half) * x - np.sin(half) * y, np.cos(half) * y + np.sin(half) * x,  # by 0.3 rad about z
-            np.cos(half) * z + np.sin(half) * w, np.cos(half) * w - np.sin(half) * z]
-    poses[mover] = [*(poses[mover, :2] + [0.03, -0.04]), poses[mover, 2], *turn]
+    poses = task.goal_poses.copy()
+    poses[mover, :2] += [0.03, -0.04]
+    poses[mover, 3:] = (Rotation.from_euler("z", 0.3) * Rotation.from_quat(poses[mover, 3:])).as_quat()
     distance, angle = control.distances(poses, task)
     np.testing.assert_allclose([distance[0], angle[0]], [0.05, 0.3], atol=1e-5)
     task.arena.kinds[mover] = "can"
@@ -181,9 +180,6 @@ def test_the_other_planners(policy, task, run):
         assert len(record["pokes"]) == 2
     if policy in ("greedy", "oracle"):
         assert left < 0.9
-    if policy == "greedy":  # straight at the goal, up to the turn that finds room for the finger
-        way = task.goal_poses[task.movers[0], :2] - record["poses"][0, task.movers[0], :2]
-        assert turn_between(record["pokes"][0, 2], np.arctan2(way[1], way[0])) < np.radians(60)
 
 
 def next_plans(monkeypatch, *plans):
@@ -236,15 +232,3 @@ def test_where_bullet_finds_the_finger_s_way_taken_the_next_start_is_used_or_the
     assert len(record["pokes"]) == 1 and np.isnan(record["starts"]).all()
     np.testing.assert_array_equal(record["poses"], np.stack([before, before]))
     np.testing.assert_array_equal(record["marks"][1], record["marks"][0])
-
-
-def test_an_arena_that_becomes_empty_ends_the_loop_and_loses_nothing(task, run, pokes, monkeypatch):
-    next_plans(monkeypatch, pokes, pokes)
-
-    def poke(*_):  # all fall off the table
-        for index in range(len(task.arena.bodies)):
-            task.arena.put(index, (3.0, 3.0 + index))
-    monkeypatch.setattr(task.arena, "poke", poke)
-    record = control.closed_loop(task, run, "random", SMALL, budget=3)
-    assert len(record["pokes"]) == 1 and len(record["rgb"]) == len(record["poses"]) == len(record["marks"]) == 2
-    assert record["distance"][1] > 1 > record["distance"][0], "the present distance, not the best so far"

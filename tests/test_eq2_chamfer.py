@@ -59,18 +59,6 @@ def test_chamfer_loss_sums_both_maps_for_each_interaction():
 
 # --- the nearest neighbour ----------------------------------------------------------------------------------------
 
-def test_squared_distances_when_references_are_shared_or_unused():
-    from hind4sight_min.ops import squared_distances
-    rng = np.random.default_rng(0)
-    queries, references, indices = rng.normal(size=(4, 3)), rng.normal(size=(5, 3)), np.array([2, 0, 2, 2])
-    expected = [sum((queries[i] - references[j]) ** 2) for i, j in enumerate(indices)]
-    assert_close(squared_distances(queries, references, indices), expected, "squared or not?")
-    for argnum, name in ((0, "queries: 2 g (q - r)"), (1, "references: each collects from every query nearest to it")):
-        found, _ = assert_gradient(squared_distances, argnum, queries, references, indices, hint=name)
-        assert_float32(squared_distances, argnum, queries, references, indices)
-    assert not found[[1, 3, 4]].any(), "nobody's neighbours must have no gradient"
-
-
 def brute_force(queries, references, valid):
     """Squared distances (B, N) over all pairs."""
     pairs = ((queries[:, :, None] - references[:, None]) ** 2).sum(axis=3)
@@ -84,7 +72,7 @@ def test_nearest_squared_distances_match_brute_force(references, share):
     rng = np.random.default_rng(1)
     queries, references = rng.normal(size=(3, 20, 3)), rng.normal(size=(3, references, 3))
     queries[:, :6] = references[:, :6]  # points that never moved
-    queries[:, 3:6, 2] += 2  # or moved along one axis only
+    queries[:, 3:6] += 2 * np.eye(3)  # or moved along one axis only
     valid = rng.random(references.shape[:2]) < share
     expected = brute_force(queries, references, valid)
     assert_close(nearest_squared_distances(queries, references, valid), expected, "squared? only valid references?")
@@ -140,20 +128,6 @@ def test_what_only_one_frame_shows_is_not_compared():
         "every pixel with depth": [[[1, 1, 1, 1, 0]], [[1, 1, 1, 1, 0]]]})
     _, next_seen = seen_in_both(valid, ~valid, occupied, next_occupied)
     assert_value(next_seen, [[0, 0, 0, 0, 1]], {"valid of the other frame": [[1, 1, 1, 0, 0]]})
-
-
-def test_the_true_flow_is_free_and_dragging_the_table_along_does_not_pay():
-    # A row of pixels 1 cm apart; a block 5 cm high on pixels 5 to 8 is pushed on by 3 cm.
-    from hind4sight_min.losses import seen_in_both
-    x = np.arange(20)
-    occupied, next_occupied = ((first <= x[None]) & (x[None] < first + 4) for first in (5, 8))
-    before, after = (np.stack([0.01 * x[None], 0 * o, 0.05 * o], axis=-1) for o in (occupied, next_occupied))
-    true = before + [0.03, 0, 0] * occupied[..., None]
-    dragged = true.copy()
-    dragged[0, [2, 3, 4, 9, 10, 11], 0] += 0.03  # the table in front of the block and that behind it move along
-    counted = seen_in_both(all_valid(before), all_valid(after), occupied, next_occupied)
-    assert chamfer(true, after)[0] > chamfer(dragged, after)[0], "over all pixels the wrong flow would win"
-    assert chamfer(true, after, *counted)[0] < 1e-12 and chamfer(dragged, after, *counted)[0] > 1e-3
 
 
 @pytest.mark.parametrize("case, named", [("nan", "queries, references.*finite"), ("none", "valid.*at least one")])

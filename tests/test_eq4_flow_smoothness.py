@@ -6,7 +6,7 @@
 """
 import numpy as np
 import pytest
-from helpers import assert_close, assert_float32, assert_gradient, assert_value
+from helpers import assert_close, assert_float32, assert_gradient, assert_value, loop_smoothness
 
 pytestmark = pytest.mark.eq4
 
@@ -58,35 +58,13 @@ def test_edge_weights_by_hand():
 
 # --- against a loop over neighbours -------------------------------------------------------------------------------
 
-def loop_smoothness(field, images, valid):
-    """(B,): neighbour by neighbour."""
-    total, valid = np.zeros(len(field)), valid.reshape(field.shape[:3])
-    for b, y, x in np.ndindex(field.shape[:3]):
-        for y2, x2 in ((y, x + 1), (y + 1, x)):
-            if y2 < field.shape[1] and x2 < field.shape[2] and valid[b, y, x] and valid[b, y2, x2]:
-                edge = np.abs(images[b, y2, x2] - images[b, y, x]).mean()
-                total[b] += np.abs(field[b, y2, x2] - field[b, y, x]).sum() * np.exp(-40 * edge)
-    return total
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3])
-def test_smoothness_of_any_field_and_its_gradient_match_a_loop(channels):
-    from hind4sight_min.losses import edge_aware_smoothness
-    rng = np.random.default_rng(0)
-    field, images = rng.normal(size=(B, H, W, channels)), rng.uniform(0, 0.08, (B, H, W, 3))
-    valid = rng.random((B, N)) < 0.8
-    assert_close(edge_aware_smoothness(field, images, valid), loop_smoothness(field, images, valid),
-                 "edges, valid or a row of neighbours?")
-    gradient, _ = assert_gradient(edge_aware_smoothness, 0, field, images, valid)
-    assert not gradient.reshape(B, N, -1)[~valid].any(), "a pixel without depth is pulled at"
-    assert_float32(edge_aware_smoothness, 0, field, images, valid)
-
-
 def test_flow_smoothness_and_its_gradient_match_a_loop():
     rng = np.random.default_rng(1)
     flow, images, valid = rng.normal(size=(B, H, W, 2)), rng.uniform(0, 0.08, (B, H, W, 3)), rng.random((B, N)) < 0.8
-    assert_close(loss_of(flow, images, valid), loop_smoothness(flow, images, valid))
-    assert_gradient(loss_of, 0, flow, images, valid)
+    assert_close(loss_of(flow, images, valid), loop_smoothness(flow, images, valid),
+                 "edges, valid or a row of neighbours?")
+    gradient, _ = assert_gradient(loss_of, 0, flow, images, valid)
+    assert not gradient.reshape(B, N, -1)[~valid].any(), "a pixel without depth is pulled at"
     assert_float32(loss_of, 0, flow, images, valid)
 
 

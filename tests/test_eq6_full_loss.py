@@ -20,19 +20,11 @@ def test_two_pokes_and_two_terms_by_hand():
         "the weights with each other's terms": 61.0})
 
 
-def test_each_term_has_its_own_weight():
-    from hind4sight_min.losses import full_loss
-    weights = dict(zip(reversed(NAMES), [2.0, 0.3, 0.0, 5.0, 0.7]))  # in another order than the terms
-    for name in NAMES:
-        terms = {other: np.array([1.0, 2, 3]) * (other == name) for other in NAMES}
-        assert_close(full_loss(terms, weights), 2 * weights[name], f"the weight of {name}: by name, not by position")
-
-
 def test_full_loss_and_its_gradient_against_the_plain_sum():
     from hind4sight_min.losses import full_loss
     rng = np.random.default_rng(0)
     terms = {name: rng.random(4) + 1 for name in NAMES}
-    weights = dict(zip(NAMES, [2.0, 0.3, 0.0, 5.0, 0.7]))
+    weights = dict(zip(reversed(NAMES), [2.0, 0.3, 0.0, 5.0, 0.7]))  # by name, not by position
     assert_close(full_loss(terms, weights), sum(weights[name] * terms[name][b] for name in NAMES for b in range(4)) / 4)
     gradients = grad(full_loss)(terms, weights)
     for name in NAMES:
@@ -40,14 +32,8 @@ def test_full_loss_and_its_gradient_against_the_plain_sum():
         step = {**terms, name: terms[name] + [0, 1e-6, 0, 0]}
         difference = (full_loss(step, weights) - full_loss(terms, weights)) / 1e-6
         assert_close(gradients[name][1], difference, f"gradient of {name}", rtol=1e-5, atol=1e-6)
-
-
-def test_float32_stays_float32():
-    from hind4sight_min.losses import full_loss
-    terms = {name: np.array([1, 2], np.float32) for name in NAMES}
-    weights = dict.fromkeys(NAMES, 0.3)
-    assert full_loss(terms, weights).dtype == np.float32
-    assert all(gradient.dtype == np.float32 for gradient in grad(full_loss)(terms, weights).values())
+    single = {name: term.astype(np.float32) for name, term in terms.items()}
+    assert full_loss(single, weights).dtype == grad(full_loss)(single, weights)["inverse"].dtype == np.float32
 
 
 # --- not in the paper ---------------------------------------------------------------------------------------------

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_se3nets import moved_blocks
 
-from hind4sight_min.geometry import optical_flow, unproject
 from hind4sight_min.lab import image_pairs
+from hind4sight_min.lab.evaluation import true_motion
 
 
 @pytest.mark.parametrize("peer", ["dis", "farneback"])
@@ -19,21 +19,15 @@ def test_flow_of_a_shifted_picture(peer):
 
 
 def test_errors_against_a_made_up_flow(monkeypatch):
-    data = moved_blocks()
+    data, made_up = moved_blocks(), {"dis": [0.5, 0.0], "farneback": [0.0, -2.0]}
     data.interactions.depth_before[:, 11] = 0  # missing: not counted
-    asked, made_up = [], {"dis": [0.5, 0.0], "farneback": [0.0, -2.0]}
-
-    def flow(peer, before, after):
-        asked.append((before is not after, peer))
-        return np.broadcast_to(np.float32(made_up[peer]), (12, 16, 2))
-    monkeypatch.setattr(image_pairs, "image_pair_flow", flow)
+    monkeypatch.setattr(image_pairs, "image_pair_flow", lambda peer, before, after: np.broadcast_to(
+        np.float32(made_up[peer]) * (before is not after), (12, 16, 2)))
     found = image_pairs.evaluate_image_pairs(data.interactions, data.truth)
-    points = unproject(data.interactions.depth_before, data.camera)
-    block = data.truth.labels == 1
-    shift = block[..., None] * data.truth.poses_after[:, None, None, 0, :3]
-    true, seen = optical_flow(points, points + shift, data.camera), data.interactions.depth_before > 0
+    motions = [true_motion(data.interactions, data.truth, row) for row in range(7)]
+    true, moving = np.concatenate([each[1] for each in motions]), np.concatenate([each[2] for each in motions])
     for peer, value in made_up.items():
         error = np.linalg.norm(value - true, axis=-1)
-        assert found[f"{peer}_optical_epe_px"] == pytest.approx(error[block & seen].mean(), rel=1e-3)
+        assert found[f"{peer}_optical_epe_px"] == pytest.approx(error[moving].mean(), rel=1e-3)
+        seen = data.interactions.depth_before.ravel() > 0
         assert found[f"{peer}_optical_epe_all_px"] == pytest.approx(error[seen].mean(), rel=1e-3)
-    assert len(asked) == 14 and all(different for different, _ in asked)

@@ -1,5 +1,4 @@
 """The record of a poke, shards on disk, the arena's cells."""
-import json
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -41,17 +40,12 @@ def test_a_single_row_is_no_selection():
     ("depth_before", lambda a: (1e4 * a).astype(np.uint16), "floating-point"),
     ("pokes", lambda a: a.astype(int), "floating-point"),
     *[(name, lambda a, bad=bad: np.where(np.arange(a.shape[-1]) == 0, np.float32(bad), a), "finite")
-      for name in ("pokes", "starts", "depth_after", "empty_depth") for bad in (np.nan, np.inf)]])
+      for name in ("pokes", "starts", "depth_after", "empty_depth") for bad in (np.nan, np.inf)],
+    *[("meta", lambda meta, bad=bad: {"settings": bad}, "settings with a positive")
+      for bad in (None, {"arena": 0.5}, {"arena": -1, "cell": 0.1}, {"arena": float("inf"), "cell": 0.1})]])
 def test_a_record_refuses_other_shapes_types_and_values(name, spoil, said):
     with pytest.raises(ValueError, match=f"{name}: expected.*{said.removeprefix('expected ')}"):
         replace(tiny_pokes(), **{name: spoil(getattr(tiny_pokes(), name))})
-
-
-@pytest.mark.parametrize("settings", [None, [], {"arena": 0.5}, {"arena": -1, "cell": 0.1},
-                                      {"arena": float("inf"), "cell": 0.1}])
-def test_a_record_needs_settings_with_a_grid(settings):
-    with pytest.raises(ValueError, match="meta: expected settings with a positive"):
-        replace(tiny_pokes(), meta={"settings": settings})
 
 
 # --- the grid -----------------------------------------------------------------------------------------------------
@@ -73,25 +67,22 @@ def test_cells_by_hand_and_outside_at_the_rim():
     np.testing.assert_array_equal(cells_of([[-9, -9], [9, -9], [-0.24, 9]], SETTINGS), [0, 19, 380])
 
 
-def test_the_occupied_grid_and_its_neighbours_against_loops():
+def test_occupied_cells_their_neighbours_and_where_the_finger_fits_against_loops():
     rng = np.random.default_rng(1)
     clouds, occupied = rng.uniform(-0.25, 0.25, (3, 30, 3)), rng.random(30) < 0.5
-    grid, near = occupied_grid(clouds, occupied, SETTINGS), np.zeros((3, 20, 20), bool)
-    expected = np.zeros((3, 20, 20), bool)
-    for j, n in np.ndindex(3, 30):
-        if occupied[n]:
-            column, row = (int((v + 0.25) / 0.025) for v in clouds[j, n, :2])
-            expected[j, row, column] = True
-            near[j, max(row - 1, 0):row + 2, max(column - 1, 0):column + 2] = True
+    places = rng.uniform(-0.26, 0.26, (3, 200, 2))
+    expected, near = np.zeros((2, 3, 20, 20), bool)
+    for j, n in np.argwhere(np.tile(occupied, (3, 1))):
+        column, row = (int((v + 0.25) / 0.025) for v in clouds[j, n, :2])
+        expected[j, row, column] = True
+        near[j, max(row - 1, 0):row + 2, max(column - 1, 0):column + 2] = True
+    grid = occupied_grid(clouds, occupied, SETTINGS)
     np.testing.assert_array_equal(grid, expected)
     np.testing.assert_array_equal(with_neighbours(grid), near)
-    places = rng.uniform(-0.26, 0.26, (3, 200, 2))
+    fits = finger_fits(places, grid, SETTINGS)
     for j, n in np.ndindex(3, 200):
-        x, y = places[j, n]
-        free = max(abs(x), abs(y)) < 0.24 and not near[j].ravel()[cells_of([x, y], SETTINGS)]
-        assert finger_fits(places, grid, SETTINGS)[j, n] == free
-        if n > 40:
-            break
+        free = np.abs(places[j, n]).max() < 0.24 and not near[j].ravel()[cells_of(places[j, n], SETTINGS)]
+        assert fits[j, n] == free, "0.24: within the finger's radius of a wall"
 
 
 # --- shards -------------------------------------------------------------------------------------------------------
@@ -109,21 +100,16 @@ def test_a_shard_comes_back_as_it_was(tmp_path):
     for name, value in asdict(saved.camera).items():
         np.testing.assert_array_equal(getattr(loaded.camera, name), value)
     assert {name: loaded.meta[name] for name in saved.meta} == saved.meta and loaded.meta["format"] == FORMAT
-    save_shard(tmp_path / "again.npz", loaded)
-    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
-    assert sorted(each.name for each in path.parent.iterdir()) == ["shard_0000.npz"]
 
 
-def test_a_shard_holds_what_its_documentation_says_without_our_code(tmp_path):
+def test_a_shard_holds_counts_of_a_tenth_of_a_millimetre_without_our_code(tmp_path):
     saved = pokes_with_holes()
     saved.depth_before[0, 0, 0] = 7.0  # 70,000 counts; modulo 2^16 it would come back as 0.4464 m
     save_shard(tmp_path / "shard_0000.npz", saved)
     with np.load(tmp_path / "shard_0000.npz") as archive:
-        counts, meta = archive["depth_before"], json.loads(str(archive["meta"]))
+        counts = archive["depth_before"]
     assert counts.dtype == np.uint16 and counts[0, 0, 0] == 65535
     np.testing.assert_array_equal(counts[1:], np.rint(saved.depth_before[1:] * 1e4))
-    assert meta["units"]["depth"] == 1e-4
-    assert meta["camera"]["arena_from_camera"] == saved.camera.arena_from_camera.tolist()
 
 
 def rewrite(path, arrays={}, meta={}, without=()):
@@ -135,14 +121,10 @@ def rewrite(path, arrays={}, meta={}, without=()):
 
 @pytest.mark.parametrize("changes, said", [
     ({"meta": {"format": "hind4sight_min interactions 0"}}, "expected format"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": np.eye(4).tolist(), "fx": 0.0}}}, "fx, fy > 0"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": np.eye(4).tolist(), "width": 17}}}, "shape"),
-    ({"meta": {"camera": {**asdict(camera()), "arena_from_camera": (2 * np.eye(4)).tolist()}}}, "rigid"),
-    ({"arrays": {"pokes": np.zeros((7, 2), np.float32)}}, "pokes: expected shape"),
+    ({"meta": {"camera": {**camera().plain, "fx": 0.0}}}, "fx, fy > 0"),
     ({"arrays": {"starts": np.full((7, 2), np.nan, np.float32)}}, "starts: expected finite"),
-    ({"arrays": {"labels": np.zeros(3)}}, "labels"), ({"without": ["pokes"]}, "pokes"),
-    ({"without": ["empty_depth"]}, "empty_depth"), ({"without": ["units"]}, "units"),
-    ({"without": ["camera"]}, "camera"), ({"without": ["settings"]}, "settings")])
+    ({"arrays": {"labels": np.zeros(3)}}, "labels"),
+    *[({"without": [name]}, name) for name in ("pokes", "empty_depth", "units", "camera", "settings")]])
 def test_a_shard_with_wrong_contents_names_file_and_field(tmp_path, changes, said):
     path = tmp_path / "shard_0000.npz"
     save_shard(path, tiny_pokes())
@@ -164,23 +146,12 @@ def test_a_data_set_is_its_shards_in_order_and_its_truth_is_never_opened(tmp_pat
     assert len(joined) == 7
 
 
-def other_camera():
-    return tiny_pokes(cam=camera(x=0.01))
-
-
-def other_grid():
-    data = tiny_pokes()
-    return replace(data, meta={**data.meta, "settings": {**SETTINGS, "cell": 0.05}})
-
-
-def other_empty_arena():
-    data = tiny_pokes()
-    return replace(data, empty_depth=data.empty_depth + np.float32(0.01))
-
-
-@pytest.mark.parametrize("other", [other_camera, other_grid, other_empty_arena])
+@pytest.mark.parametrize("other", [
+    lambda data: tiny_pokes(cam=camera(x=0.01)),
+    lambda data: replace(data, meta={**data.meta, "settings": {**SETTINGS, "cell": 0.05}}),
+    lambda data: replace(data, empty_depth=data.empty_depth + np.float32(0.01))], ids=["camera", "grid", "arena"])
 def test_shards_of_two_worlds_do_not_mix(tmp_path, other):
-    for index, data in enumerate((tiny_pokes(), other())):
+    for index, data in enumerate((tiny_pokes(), other(tiny_pokes()))):
         save_shard(tmp_path / f"shard_{index:04d}.npz", data)
     with pytest.raises(ValueError, match="shard_0001.npz: another camera, arena or grid"):
         load_interactions(tmp_path)

@@ -7,8 +7,8 @@ from tiny import SIZES, random_run, tiny_pokes
 
 from hind4sight_min import networks
 from hind4sight_min.geometry import poke_axes
-from hind4sight_min.networks import (encode, encoder_features, first_met, forward_model, fourier, height_map,
-                                     init_parameters, inverse_model, poke_features, predict, softmax, state_embedding)
+from hind4sight_min.networks import (encode, first_met, forward_model, height_map, init_parameters, inverse_model,
+                                     predict, softmax, state_embedding)
 from hind4sight_min.scene import look
 from hind4sight_min.training import scenes_of
 
@@ -51,16 +51,7 @@ def test_masks_are_a_distribution_and_the_background_never_moves():
     np.testing.assert_array_equal(prediction.rotations[:, 0], np.broadcast_to(np.eye(3), (2, 3, 3)))
     assert not prediction.translations[:, 0].any()
     assert np.abs(prediction.points - points).max() > 1e-3  # the other masks do move
-    for rotation in prediction.rotations.reshape(-1, 3, 3):
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-10)
-
-
-def test_softmax_against_its_formula_and_at_large_logits():
-    logits = np.array([[1.0, 2.0, 4.0], [1000.0, 1001.0, 999.0]])
-    expected = np.exp(logits - logits.max(axis=1, keepdims=True))
-    np.testing.assert_allclose(softmax(logits), expected / expected.sum(axis=1, keepdims=True))
-    jacobian = np.diag(softmax(logits)[0]) - np.outer(softmax(logits)[0], softmax(logits)[0])
-    np.testing.assert_allclose(grad(lambda x: (softmax(x)[0] * [0, 0, 1.0]).sum())(logits)[0], jacobian[2])
+    np.testing.assert_allclose(softmax(np.array([1000.0, 1001, 999])), softmax(np.array([1.0, 2, 0])))
 
 
 def test_a_mask_pushed_to_nothing_keeps_a_gradient():
@@ -88,18 +79,6 @@ def test_the_forward_model_turns_with_the_arena_except_for_its_arena_features():
     np.testing.assert_allclose(after.masks, before.masks, atol=1e-10)
 
 
-def test_points_that_do_not_count_do_not_change_the_others():
-    rng = np.random.default_rng(4)
-    points, valid, pokes = cloud(rng)
-    params = random_parameters(rng)
-    valid[:, :10] = False
-    first = forward_model(params, SIZES, points, valid, pokes)
-    points[:, :10] = rng.uniform(-1, 1, (2, 10, 3))
-    second = forward_model(params, SIZES, points, valid, pokes)
-    np.testing.assert_allclose(second.points[:, 10:], first.points[:, 10:], atol=1e-12)
-    np.testing.assert_allclose(second.masks[:, 10:], first.masks[:, 10:], atol=1e-12)
-
-
 @pytest.mark.parametrize("name", sorted(init_parameters(SIZES, np.random.default_rng(0))))
 def test_gradient_of_every_parameter_against_finite_differences(name):
     rng = np.random.default_rng(5)
@@ -119,35 +98,15 @@ def test_gradient_of_every_parameter_against_finite_differences(name):
     np.testing.assert_allclose((grad(scalar)(params[name]) * direction).sum(), expected, rtol=1e-4)
 
 
-def test_the_siamese_encoder_serves_both_models():
-    rng = np.random.default_rng(6)
-    points, valid, pokes = cloud(rng)
-    params, cells, seen = random_parameters(rng), rng.uniform(-0.2, 0.2, (7, 2)), evidence(rng, points)
-    for model in (lambda p: forward_model(p, SIZES, points, valid, pokes).points.sum(),
-                  lambda p: inverse_model(p, *seen, cells)[0][:, 0].sum()):
-        assert np.abs(grad(lambda w: model({**params, "encoder_1_w": w}))(params["encoder_1_w"])).max() > 1e-6
-
-
-def test_the_state_embedding_is_the_sum_over_objects_and_pulls_at_their_points_alone():
-    # What makes L_sim a loss of masks and motions: its gradient with respect to the predicted points.
-    rng = np.random.default_rng(8)
+def test_the_state_embedding_is_the_sum_over_objects_and_its_gradient_stops_at_the_encoder():
+    rng = np.random.default_rng(8)  # where its gradient goes on, to masks and motions, test_training asks
     points, _, _ = cloud(rng)
-    params, occupied, readout = random_parameters(rng), points[..., 2] > 0.03, rng.standard_normal((2, 6))
+    params, occupied = random_parameters(rng), points[..., 2] > 0.03
     for b in range(2):
         expected = sum(encode(params, points[b, n]) for n in np.flatnonzero(occupied[b]))
         np.testing.assert_allclose(state_embedding(params, points, occupied)[b], networks.STATE_GAIN * expected)
-
-    def scalar(where):
-        return (state_embedding(params, where, occupied) * readout).sum()
-    found, step = grad(scalar)(points), 1e-7
-    assert not found[~occupied].any() and np.abs(found[occupied]).min() > 0
-    direction = rng.standard_normal(points.shape)
-    expected = (scalar(points + step * direction) - scalar(points - step * direction)) / (2 * step)
-    assert abs(expected) > 1
-    np.testing.assert_allclose((found * direction).sum(), expected, rtol=1e-5)
-    weights = grad(lambda w: (state_embedding({**params, "encoder_2_w": w}, points, occupied) * readout).sum()
-                   + w.sum())(params["encoder_2_w"])
-    np.testing.assert_array_equal(weights, np.ones((6, 6)))  # and not at the encoder, which would fall silent
+    weights = grad(lambda w: state_embedding({**params, "encoder_2_w": w}, points, occupied).sum() + w.sum())
+    np.testing.assert_array_equal(weights(params["encoder_2_w"]), np.ones((6, 6)))  # that would fall silent
 
 
 def test_a_motion_turns_about_the_pokes_target_and_then_shifts():
@@ -200,22 +159,6 @@ def test_the_inverse_model_gives_the_start_first_and_then_the_end():
     again, shifted = inverse_model(params, *seen, cells)
     np.testing.assert_allclose(again, start, err_msg="the two maps are swapped")
     np.testing.assert_allclose(shifted, end + 5)
-
-
-def test_fourier_against_numpy():
-    x = np.array([[0.03, -0.11]])
-    expected = [f(2 * np.pi * v / w) for f in (np.sin, np.cos) for v in x[0] for w in (0.4, 0.1)]
-    np.testing.assert_allclose(fourier(x, (0.4, 0.1))[0], expected)
-
-
-@pytest.mark.parametrize("features, unit", [(encoder_features, 0.25), (poke_features, 0.1)])
-def test_position_features_tell_the_table_from_what_stands_on_it(features, unit):
-    points = np.array([[0.05, -0.02, 0.0], [0.05, -0.02, 0.01]], np.float32)
-    found = features(points)
-    assert found.shape == (2, 20) and found.dtype == np.float32
-    np.testing.assert_allclose(found[:, :3], points / unit, rtol=1e-6)
-    np.testing.assert_allclose(found[:, 3], [0, np.tanh(1.0)], rtol=1e-6)
-    np.testing.assert_array_equal(found[0, 4:], found[1, 4:])  # the waves are of x and y alone
 
 
 def test_the_height_map_against_a_loop_over_points():

@@ -7,7 +7,7 @@ from tiny import SETTINGS, TINY, camera, random_run, tiny_pokes
 
 from hind4sight_min import planning
 from hind4sight_min.geometry import project
-from hind4sight_min.interactions import cell_centres, finger_fits, occupied_grid
+from hind4sight_min.interactions import cell_centres, cells_of, finger_fits, occupied_grid, with_neighbours
 from hind4sight_min.lab import evaluation
 from hind4sight_min.planning import Goal, Search, View, cem, draw_pokes, plan, planning_cost, possible_starts, roll
 from hind4sight_min.scene import Scene
@@ -26,32 +26,23 @@ def island(count=20, seed=0, marks=((0, 0, 0.03),), table=()):
 
 # --- the model ----------------------------------------------------------------------------------------------------
 
-def test_planning_predicts_exactly_what_was_evaluated():
+def test_planning_predicts_exactly_what_was_evaluated_and_each_of_many_candidates_as_alone(monkeypatch):
     data = tiny_pokes(cam=CAMERA)
     run = random_run(TINY, data=data)
+    monkeypatch.setattr(planning, "CHUNK", 2)
     for row in range(3):
         answer = evaluation.ask(run, data, row)
         marks = answer.before.points[0][answer.before.occupied[0]][:1]
         view = planning.view_of(answer.before, marks[:0])
-        moved = planning.learned_step(run, view)(view.cloud[None], data.pokes[[row]])
-        np.testing.assert_array_equal(moved[0], answer.prediction.points[0])
-        assert np.abs(moved[0] - view.cloud).max() > 1e-3
+        step = planning.learned_step(run, view)
+        alone = np.stack([step(view.cloud[None], poke[None])[0] for poke in data.pokes[:5]])
+        np.testing.assert_array_equal(alone[row], answer.prediction.points[0])
+        assert np.abs(alone[row] - view.cloud).max() > 1e-3
+        together = step(np.repeat(view.cloud[None], 5, axis=0), data.pokes[:5])
+        np.testing.assert_allclose(together, alone, atol=1e-6)
         marked = planning.view_of(answer.before, marks)
         again = planning.learned_step(run, marked)(marked.cloud[None], data.pokes[[row]])
         assert np.abs(again[0, -1] - marks).max() > 1e-4  # a mark moves with its object
-
-
-def test_many_candidates_are_predicted_as_each_alone(monkeypatch):
-    data = tiny_pokes(cam=CAMERA)
-    run, (scene, _) = random_run(TINY, data=data), scenes_of(data[[2]])
-    view = planning.view_of(scene, scene.points[0][scene.occupied[0]][:2])
-    pokes = np.repeat(data.pokes[[2]], 5, axis=0) + np.linspace(0, 0.04, 5, dtype=np.float32)[:, None]
-    monkeypatch.setattr(planning, "CHUNK", 2)
-    step = planning.learned_step(run, view)
-    together = step(np.repeat(view.cloud[None], 5, axis=0), pokes)
-    for found, poke in zip(together, pokes):
-        np.testing.assert_allclose(found, step(view.cloud[None], poke[None])[0], atol=1e-6)
-    assert np.abs(together[0] - together[4]).max() > 1e-3
 
 
 def test_a_cloud_that_moved_is_looked_at_where_it_is_now():
@@ -81,30 +72,18 @@ def test_possible_starts_against_a_loop():
     grid = rng.random((60, 20, 20)) < 0.04
     pokes = np.column_stack([rng.uniform(-0.26, 0.26, (60, 2)), rng.uniform(-np.pi, np.pi, 60)])
     pokes[:6, 0], pokes[:6, 2], grid[:6, :, 19] = 0.251, 0.1, True  # next to an object, but on a wall
-    found, possible_ones, at_rim = possible_starts(pokes, grid, SETTINGS, lengths=3), 0, 0
+    found, near, possible_ones = possible_starts(pokes, grid, SETTINGS, lengths=3), with_neighbours(grid), 0
     for j, (x, y, angle) in enumerate(pokes):
-        def near(px, py):
-            column, row = (min(max(int(np.floor((v + 0.25) / 0.025)), 0), 19) for v in (px, py))
-            return grid[j, max(row - 1, 0):row + 2, max(column - 1, 0):column + 2].any()
         for length, start in zip((0.10, 0.12, 0.14), found[j]):
-            px, py = x - length * np.cos(angle), y - length * np.sin(angle)
-            reach = max(abs(px), abs(py))
-            possible = reach < 0.24 and max(abs(x), abs(y)) < 0.25 and near(x, y) and not near(px, py)
-            at_rim += 0.24 < reach < 0.25
-            assert np.isfinite(start).all() == possible
-            if possible:
-                np.testing.assert_allclose(start, [px, py])
-                possible_ones += 1
-    assert possible_ones > 15 and at_rim > 2
+            expected = np.array([x - length * np.cos(angle), y - length * np.sin(angle)])
+            possible = (max(abs(x), abs(y)) < 0.25 and near[j].ravel()[cells_of([x, y], SETTINGS)]
+                        and finger_fits(expected[None, None], grid[[j]], SETTINGS)[0, 0])
+            np.testing.assert_allclose(start, expected if possible else [np.nan, np.nan])
+            possible_ones += possible
+    assert 15 < possible_ones < 150
     for row, options in zip(planning.first_start(found), found):
         options = options[np.isfinite(options[:, 0])]
         assert np.isnan(row).all() if not len(options) else (row == options[0]).all()
-
-
-def test_the_finger_keeps_its_radius_from_a_wall():
-    places = np.array([[[0.0, 0.239], [0.0, 0.241], [-0.241, 0.1], [0.24999, 0.24999]]])
-    fits = finger_fits(places, np.zeros((1, 20, 20), bool), SETTINGS)
-    np.testing.assert_array_equal(fits, [[True, False, False, False]], err_msg="within the finger's radius of a wall")
 
 
 def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere():
@@ -120,9 +99,6 @@ def test_drawn_pokes_lie_on_what_stands_there_and_come_from_anywhere():
     starts = possible_starts(drawn[:, 0], np.repeat(grid, 300, axis=0), SETTINGS)
     assert np.isfinite(starts[..., 0]).any(axis=1).all()
     assert np.histogram(drawn[..., 1, 2], bins=6, range=(-np.pi, np.pi))[0].min() > 25
-
-
-def test_no_room_behind_any_object_is_said():
     x, y = np.meshgrid(np.arange(-0.24, 0.25, 0.02), np.arange(-0.24, 0.25, 0.02))
     full = island(marks=np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)]))
     with pytest.raises(planning.NoPoke, match="no room for the finger"):
@@ -224,16 +200,6 @@ def test_cem_finds_the_minimum_of_a_bowl_where_a_part_is_forbidden():
     assert all(len(np.unique(population[1:, 0, 0])) > 90 for _, population, *_ in seen), "the spread collapses"
 
 
-def test_elites_of_infinite_cost_are_left_out():
-    population, means = first_population(4), []
-
-    def cost(sequences):  # three candidates are possible, and they lie together
-        return np.where(np.arange(len(sequences)) < 3, 1.0 + np.arange(len(sequences)), np.inf)
-    population[:3] = np.float32([[[0.1, 0.1, 0.5]], [[0.11, 0.1, 0.5]], [[0.12, 0.1, 0.5]]])
-    cem(cost, population, np.random.default_rng(3), Search(iterations=1), lambda *state: means.append(state[3]))
-    np.testing.assert_allclose(means[0], [[0.11, 0.1, 0.5]], rtol=1e-5)
-
-
 def test_cem_keeps_the_best_ever_and_begins_every_round_with_it():
     costs, rounds = [], []
 
@@ -247,17 +213,19 @@ def test_cem_keeps_the_best_ever_and_begins_every_round_with_it():
         np.testing.assert_array_equal(population[0], best)
 
 
-def test_nan_loses_and_where_nothing_is_possible_that_is_said():
-    population = first_population(4)
-    only = population[7].copy()
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+def test_what_is_impossible_is_no_elite_and_where_nothing_is_possible_that_is_said(bad):
+    population, means, rng = first_population(4), [], np.random.default_rng(3)
+    population[:3] = np.float32([[[0.1, 0.1, 0.5]], [[0.11, 0.1, 0.5]], [[0.12, 0.1, 0.5]]])
 
-    def cost(sequences):
-        return np.where((sequences == only).all(axis=(1, 2)), 1.0, np.nan)
-    best, lowest = cem(cost, population, np.random.default_rng(3), Search(iterations=3))
-    np.testing.assert_array_equal(best, only)
+    def cost(sequences):  # these three are possible
+        return np.where(np.arange(len(sequences)) < 3, 1.0 + np.arange(len(sequences)), bad)
+    best, lowest = cem(cost, population, rng, Search(iterations=1), lambda *state: means.append(state[3]))
+    np.testing.assert_allclose(means[0], [[0.11, 0.1, 0.5]], rtol=1e-5)
+    np.testing.assert_array_equal(best, population[0])
     assert lowest == 1
     with pytest.raises(planning.NoPoke, match="no candidate poke is possible"):
-        cem(lambda s: np.full(len(s), np.nan), population, np.random.default_rng(3), Search())
+        cem(lambda s: np.full(len(s), bad), population, rng, Search())
 
 
 @pytest.mark.parametrize("changes, named", [

@@ -1,6 +1,5 @@
 """Training that is stopped and goes on: its log, its checkpoints, its seconds."""
 import csv
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +7,9 @@ import pytest
 from tiny import TINY, tiny_pokes
 
 from hind4sight_min import training
+from hind4sight_min.disk.checkpoints import load_run
 from hind4sight_min.lab import runs
 from hind4sight_min.lab.runs import train_saving
-from hind4sight_min.disk.checkpoints import load_run
 from hind4sight_min.training import start_run
 
 
@@ -63,19 +62,3 @@ def test_seconds_add_up_over_calls_and_a_checkpoint_is_written_in_time(tmp_path,
     run.recipe = replace(run.recipe, steps=10)
     train_saving(data, run, tmp_path / "run.npz", on_step=tick)
     assert run.meta["seconds"] == 250.0
-
-
-def test_jobs_become_processes_and_no_more_than_there_are_chunks(tmp_path, monkeypatch):
-    asked = []
-
-    @contextmanager
-    def parallel_map(jobs):
-        asked.append(jobs)
-        yield map
-    monkeypatch.setattr(runs, "parallel_map", parallel_map)
-    for jobs in (1, 2, 9):
-        train_saving(tiny_pokes(), start_run(replace(TINY, batch=12, steps=1), tiny_pokes()), tmp_path / "run.npz",
-                     jobs=jobs)
-    assert asked == [1, 2, 2]
-    with pytest.raises(ValueError, match="jobs"):
-        train_saving(tiny_pokes(), start_run(TINY, tiny_pokes()), tmp_path / "run.npz", jobs=0)

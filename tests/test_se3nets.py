@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from helpers import assert_gradient
-from tiny import TINY, random_run, tiny_pokes
+from tiny import TINY, random_run, still_truth, tiny_pokes
 
 from hind4sight_min import training
 from hind4sight_min.geometry import unproject
@@ -13,17 +13,14 @@ from hind4sight_min.lab import se3nets
 from hind4sight_min.lab.noise import with_depth_noise
 from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.lab.se3nets import Supervised, association_loss, supervised, true_targets
-from hind4sight_min.sim.truth import Truth
 
 
 def moved_blocks(count=7):
     """Tiny pokes and a truth in which each one's block, object 1, moves along x, by another centimetre in every row."""
     data = tiny_pokes(count)
-    before = np.zeros((count, 7, 7), np.float32)
-    before[..., 6] = 1
-    after = before.copy()
-    after[:, 0, 0] = 0.01 * np.arange(1, count + 1)
-    return Supervised(data, Truth((data.empty_depth - data.depth_before > 0.01).astype(np.uint8), before, after))
+    truth = still_truth(data.empty_depth - data.depth_before > 0.01)
+    truth.poses_after[:, 0, 0] = 0.01 * np.arange(1, count + 1)
+    return Supervised(data, truth)
 
 
 def expected_loss(data):
@@ -37,9 +34,7 @@ def test_association_loss_is_the_sum_of_squares_over_valid_points():
     valid = rng.random((2, 6)) < 0.6
     by_hand = [sum(np.sum((predicted[b, n] - targets[b, n]) ** 2) for n in range(6) if valid[b, n]) for b in (0, 1)]
     np.testing.assert_allclose(association_loss(predicted, targets, valid), by_hand, rtol=1e-12)
-    gradient, weights = assert_gradient(association_loss, 0, predicted, targets, valid)
-    expected = 2 * weights[:, None, None] * (predicted - targets) * valid[..., None]
-    np.testing.assert_allclose(gradient, expected, rtol=1e-9)
+    assert_gradient(association_loss, 0, predicted, targets, valid)
 
 
 def test_exact_targets_are_the_true_motion_from_where_the_model_sees_a_point():

@@ -19,18 +19,6 @@ def write(folder, index=0, count=3):
     return truth
 
 
-def test_true_scene_flow_by_hand():
-    points = np.array([[[0.1, 0.0, 0.05], [0.1, 0.1, 0.05], [0.3, 0.2, 0.0]]], np.float32)
-    labels = np.array([[1, 2, 0]], np.uint8)
-    before, after = np.zeros((7, 7), np.float32), np.zeros((7, 7), np.float32)
-    before[:2, 6] = after[:2, 6] = 1
-    before[0, :3], after[0, :3] = [0.1, 0, 0.02], [0.13, -0.01, 0.02]  # object 1 slides
-    before[1, :3] = after[1, :3] = [0.1, 0, 0.02]  # object 2 turns by 90 degrees about its own position
-    after[1, 3:] = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
-    flow = true_scene_flow(points, labels, before, after)
-    np.testing.assert_allclose(flow, [[[0.03, -0.01, 0], [-0.1, -0.1, 0], [0, 0, 0]]], atol=1e-7)
-
-
 def test_true_scene_flow_against_scipy_point_by_point():
     rng = np.random.default_rng(1)
     points, labels = rng.uniform(-0.2, 0.2, (9, 11, 3)), rng.integers(0, 5, (9, 11), np.uint8)

@@ -1,6 +1,5 @@
 """Batches, the loss of Eq. (6), the optimisers, the loop, checkpoints."""
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -49,27 +48,14 @@ def test_image_noise_is_on_the_images_of_frame_t_alone_and_every_pixels_own():
     assert not np.array_equal(noisy.before.images, other.before.images)
 
 
-def test_image_noise_lets_a_motion_begin():
-    """Three still edges and one that moved: without noise the least common motion costs, with noise it pays."""
-    count, brightness = 4000, 0.05 * np.arange(6, dtype=np.float32)[None, None, :, None]
-    still, moved = np.tile(brightness, (1, 3, 1, 1)), np.tile(brightness - 0.05, (1, 1, 1, 1))  # a pixel to the right
-    image = np.concatenate([still, brightness], axis=1).repeat(count, axis=0)
-    next_image = np.concatenate([still, moved], axis=1).repeat(count, axis=0)
-    valid = np.ones((count, 4, 6), bool)
-    valid[..., [0, -1]] = False  # these may leave the picture
-
-    def loss(step, noise):
-        flow = np.zeros((count, 4, 6, 2), np.float32)
-        flow[..., 0] = step
-        return np.mean(losses.photometric_loss(image + noise, next_image, flow, valid.reshape(count, 24)))
-
-    none, noise = 0 * image, np.float32(0.003) * RNG(0).standard_normal(image.shape, np.float32)
-    for step in (1 / 32, 1 / 16):  # OpenCV 4 knows no finer ones
-        assert loss(step, none) > loss(0, none) + 0.01 * step and loss(-step, none) > loss(0, none) + 0.01 * step
-    assert loss(1 / 32, noise) < loss(0, noise) - 1e-3
-
-
 # --- the loss -----------------------------------------------------------------------------------------------------
+
+def looked_at(scene, pokes):
+    result = np.zeros(scene.valid.shape, bool)
+    for i, (rows, seen) in enumerate(zip(*look(scene, pokes))):
+        result[i, rows[seen]] = True
+    return result
+
 
 def test_every_term_gets_its_own_arguments():
     data, run = tiny_pokes(), random_run()
@@ -86,7 +72,7 @@ def test_every_term_gets_its_own_arguments():
     flow = optical_flow(before.points, predicted, data.camera).reshape(before.images.shape[:3] + (2,))
     maps = losses.distance_maps(predicted, after.points, valid, next_valid)
     start, end = networks.inverse_model(params, *batch.evidence)
-    here, there = (networks.state_embedding(params, points, scene.occupied & _in_box(scene, batch.pokes))
+    here, there = (networks.state_embedding(params, points, scene.occupied & looked_at(scene, batch.pokes))
                    for points, scene in ((predicted, before), (after.points, after)))
     expected = {
         "chamfer": losses.chamfer_loss(*maps),
@@ -104,13 +90,6 @@ def test_every_term_gets_its_own_arguments():
     assert set(loss_terms(params, SIZES, batch, data.camera, ["chamfer", "inverse"])) == {"chamfer", "inverse"}
 
 
-def _in_box(scene, pokes):
-    result = np.zeros(scene.valid.shape, bool)
-    for i, (rows, seen) in enumerate(zip(*look(scene, pokes))):
-        result[i, rows[seen]] = True
-    return result
-
-
 def gradient_of(run, batch, data, weights, vector=None):
     """Terms' means and gradient of the full loss on one batch."""
     vector = run.vector if vector is None else vector
@@ -124,9 +103,10 @@ def gradient_of(run, batch, data, weights, vector=None):
 @pytest.mark.parametrize("name", [name for name in WEIGHTS if name != "photometric"])
 def test_the_gradient_of_every_term_against_finite_differences(name, monkeypatch):
     # The photometric term has finite differences of its own in test_eq3: cv2.remap rounds float64 positions.
-    monkeypatch.setattr(networks, "STATE_GAIN", 0.0)  # L_sim's gradient is cut at the encoder: the next test
     data, run = tiny_pokes(), random_run()
     batch, vector = doubled(make_batch(data, TINY, RNG(0))), run.vector.astype(float)
+    fixed = unflatten(vector, run.layout)  # of L_sim: its gradient stops at the encoder that compares
+    monkeypatch.setattr(training, "state_embedding", lambda params, *given: networks.state_embedding(fixed, *given))
     value, gradient = gradient_of(run, batch, data, {name: 1.0}, vector)
     direction, step = RNG(1).standard_normal(vector.shape), 1e-7
     values = [gradient_of(run, batch, data, {name: 1.0}, vector + sign * step * direction)[0] for sign in (1, -1)]
@@ -135,38 +115,12 @@ def test_the_gradient_of_every_term_against_finite_differences(name, monkeypatch
     np.testing.assert_allclose(gradient @ direction, expected, rtol=2e-3)
 
 
-def test_the_gradient_of_l_sim_reaches_masks_and_motions_and_stops_at_the_encoder_that_compares():
-    data, run = tiny_pokes(), random_run()
-    batch, vector = doubled(make_batch(data, TINY, RNG(0))), run.vector.astype(float)
-    fixed = unflatten(vector, run.layout)  # the encoder that compares
-    rows, next_rows = (look(scene, batch.pokes)[0] for scene in (batch.before, batch.after))
-
-    def embedded(points, scene, rows):
-        pick = np.arange(len(rows))[:, None], rows
-        return networks.state_embedding(fixed, points[pick], scene.occupied[pick])
-
-    def similarity(vector):
-        predicted = networks.predict(unflatten(vector, run.layout), SIZES, batch.before, batch.pokes).points
-        return losses.embedding_loss(embedded(predicted, batch.before, rows),
-                                     embedded(batch.after.points, batch.after, next_rows)).mean()
-    direction, step = RNG(1).standard_normal(vector.shape), 1e-7
-    expected = (similarity(vector + step * direction) - similarity(vector - step * direction)) / (2 * step)
-    found = grad(similarity)(vector)
-    assert abs(expected) > 1e-2
-    np.testing.assert_allclose(found @ direction, expected, rtol=2e-3)
-    whole = gradient_of(run, batch, data, {"inverse": 1.0}, vector)[1]
-    for name in ("mask_w", "motion_1_w"):  # nothing else of L_inv reaches them
-        np.testing.assert_allclose(*(unflatten(each, run.layout)[name] for each in (whole, found)), rtol=1e-6)
-
-
 @pytest.mark.parametrize("name", WEIGHTS)
-def test_every_term_reaches_masks_motions_and_encoder(name):
+def test_every_term_reaches_masks_motions_and_encoder_in_float32(name):
     data, run = tiny_pokes(), random_run()
     parts = unflatten(gradient_of(run, make_batch(data, TINY, RNG(0)), data, {name: 1.0})[1], run.layout)
-    assert parts["mask_w"].dtype == np.float32, "a derivative turned float32 into float64"
     for reached in ("encoder_1_w", "mask_w", *["motion_1_w"] * (name != "binary_masks")):
-        assert np.abs(parts[reached]).max() > 0, reached
-    assert (np.abs(parts["heatmaps_w"]).max() > 0) == (name == "inverse")
+        assert np.abs(parts[reached]).max() > 0 and parts[reached].dtype == np.float32, reached
 
 
 # --- optimisers ---------------------------------------------------------------------------------------------------
@@ -210,17 +164,9 @@ def test_muon_is_adam_for_vectors_and_the_polar_factor_of_the_momentum_for_matri
         assert 0.6 < np.median(s) < 1.25
 
 
-def test_orthogonalised_keeps_singular_vectors_and_evens_out_their_values():
-    rng = RNG(3)
-    u, v = (np.linalg.qr(rng.standard_normal((size, 5)))[0] for size in (9, 7))
-    for matrix, wanted in (((u * [10, 5, 3, 2, 1]) @ v.T, u @ v.T), ((v * [10, 5, 3, 2, 1]) @ u.T, v @ u.T)):
-        for scale in (1e-6, 1.0, 1e6):
-            found = training.orthogonalised(np.float32(scale) * matrix.astype(np.float32))
-            assert found.dtype == np.float32 and found.shape == matrix.shape
-            np.testing.assert_allclose(np.linalg.svd(found)[1][:5], 1, atol=0.35)
-            assert np.sum(found * wanted) / np.linalg.norm(found) / np.linalg.norm(wanted) > 0.97
-    for least in (0, 1e-30):  # of a layer that a loss does not reach, or not any more; squares of 1e-30 are 0
-        assert np.abs(training.orthogonalised(np.full((4, 3), least, np.float32))).max() < 1e-10
+@pytest.mark.parametrize("entry", [0, 1e-30])  # the squares of 1e-30 are 0
+def test_a_layer_that_no_loss_reaches_stays(entry):
+    assert np.abs(training.orthogonalised(np.full((4, 3), entry, np.float32))).max() < 1e-10
 
 
 def test_the_learning_rate_warms_up_and_falls_as_a_cosine():
@@ -237,25 +183,21 @@ def test_the_learning_rate_warms_up_and_falls_as_a_cosine():
 
 # --- the loop -----------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize("optimiser, rate", [("muon", 2e-2), ("adam", 2e-2)])
-def test_training_lowers_the_loss_it_trains(optimiser, rate):
-    recipe, seen = replace(TINY, steps=40, batch=7, learning_rate=rate, optimiser=optimiser), []
+@pytest.mark.parametrize("optimiser", ["muon", "adam"])
+def test_training_lowers_the_loss_it_trains(optimiser):
+    recipe, seen = replace(TINY, steps=40, batch=7, learning_rate=0.02, optimiser=optimiser), []
     train(tiny_pokes(), start_run(recipe, tiny_pokes()), on_step=lambda run, terms: seen.append(terms["inverse"]))
     assert len(seen) == 40 and np.mean(seen[-5:]) < 0.8 * np.mean(seen[:5])
 
 
-def test_every_epoch_shows_every_row_once_in_an_order_of_the_seeds_own():
+def test_every_epoch_shows_every_row_once_and_order_and_first_weights_are_the_seeds_own():
     recipe = replace(TINY, batch=5)
     rows = np.concatenate([training.rows_of_step(recipe, 7, step) for step in range(7)]).reshape(5, 7)  # 5 epochs
     np.testing.assert_array_equal(np.sort(rows, axis=1), np.tile(np.arange(7), (5, 1)))
     assert len({tuple(epoch) for epoch in rows}) > 1
     other = [training.rows_of_step(replace(recipe, seed=4), 7, step) for step in range(7)]
     assert not np.array_equal(np.concatenate(other), rows.ravel()), "the order of the pokes ignores the seed"
-
-
-def test_a_seed_decides_initialisation_and_noise():
-    data = tiny_pokes()
-    first, same, other = (start_run(replace(TINY, seed=seed), data).vector for seed in (1, 1, 2))
+    first, same, other = (start_run(replace(TINY, seed=seed), tiny_pokes()).vector for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, same)
     assert not np.array_equal(first, other), "the initialisation ignores the seed"
 
@@ -292,79 +234,39 @@ def test_the_gradient_of_a_batch_is_that_of_its_chunks_and_a_map_may_spread_them
         assert parts[name] == pytest.approx(terms[name], rel=1e-3, abs=1e-5), name
 
 
-def test_another_objective_and_a_weight_of_nothing():
-    data = tiny_pokes()
-
-    def pull(params, recipe, interactions, rng, by):  # |mask_b - by|^2 has its minimum where it says
-        return {"pull": ((params["mask_b"] - by) ** 2).sum() * np.ones(len(interactions))}
-    run = start_run(replace(TINY, steps=200, learning_rate=0.05, weights={"pull": 1.0}), data)
-    train(data, run, partial(pull, by=0.5))
-    np.testing.assert_allclose(run.params["mask_b"], 0.5, atol=0.05)
-    one, two = (train(data, start_run(replace(TINY, steps=1, weights=weights), data)) for weights in
-                ({"chamfer": 1e3}, dict.fromkeys(WEIGHTS, 0.0) | {"chamfer": 1e3}))
-    np.testing.assert_array_equal(one.vector, two.vector, err_msg="a missing weight is 0")
-
-
 def test_a_gradient_that_is_not_finite_stops_the_run_and_leaves_it_as_it_was():
     data, run = tiny_pokes(), random_run(replace(TINY, weights={"chamfer": 1.0}))
 
     def broken(params, recipe, interactions, rng):
         return {"chamfer": np.ones(len(interactions)) * (params["mask_b"] * np.inf).sum()}
-    before = [run.vector.copy(), run.first_moment.copy(), run.second_moment.copy()]
+    before = run.vector.copy()
     with pytest.raises(FloatingPointError, match="step 0"), np.errstate(invalid="ignore"):
         train(data, run, broken)
-    for old, new in zip(before, (run.vector, run.first_moment, run.second_moment)):
-        np.testing.assert_array_equal(old, new)
-    assert run.step == 0
+    np.testing.assert_array_equal(run.vector, before)
+    assert run.step == 0 and not run.first_moment.any() and not run.second_moment.any()
 
 
 # --- checkpoints --------------------------------------------------------------------------------------------------
 
-def test_a_resumed_run_is_the_same_run(tmp_path):
-    data, path = tiny_pokes(count=18), tmp_path / "run.npz"  # an epoch ends in the middle of the fourth step
-    whole = train(data, start_run(TINY, data))
-
-    def stop_at_two(run, terms):
-        checkpoints.save_run(path, run)
-        if run.step == 2:
-            raise KeyboardInterrupt
-    with pytest.raises(KeyboardInterrupt):
-        train(data, start_run(TINY, data), on_step=stop_at_two)
-    resumed = checkpoints.load_run(path)
-    assert resumed.step == 2 and resumed.recipe == TINY
-    train(data, resumed)
-    for name in ("vector", "first_moment", "second_moment"):
-        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
-
-
 def test_a_checkpoint_comes_back_as_it_was(tmp_path):
     run = train(tiny_pokes(), start_run(TINY, tiny_pokes()))
-    checkpoints.save_run(tmp_path / "a.npz", run)
-    loaded = checkpoints.load_run(tmp_path / "a.npz")
-    assert loaded.recipe == run.recipe and loaded.layout == run.layout and loaded.meta == run.meta
-    checkpoints.save_run(tmp_path / "b.npz", run, resumable=False)
+    for name, resumable in (("a.npz", True), ("b.npz", False)):
+        checkpoints.save_run(tmp_path / name, run, resumable)
+        loaded = checkpoints.load_run(tmp_path / name)
+        for field in ("recipe", "layout", "step", "meta"):
+            assert getattr(loaded, field) == getattr(run, field), field
+        for field in ("vector", "first_moment", "second_moment"):
+            moments = getattr(run, field)
+            expected = moments if resumable or field == "vector" else 0 * moments
+            np.testing.assert_array_equal(getattr(loaded, field), expected, err_msg=field)
     assert (tmp_path / "b.npz").stat().st_size < 0.6 * (tmp_path / "a.npz").stat().st_size
-    np.testing.assert_array_equal(checkpoints.load_run(tmp_path / "b.npz").vector, run.vector)
 
 
-def spoil_vector(run):
-    run.vector = run.vector[:-1]
-
-
-def spoil_number(run):
-    run.vector[5] = np.nan
-
-
-def widen_layer(run):
-    run.layout["motion_2_w"] = (10, 11)
-
-
-def drop_layer(run):
-    del run.layout["cell_3_b"]
-
-
-@pytest.mark.parametrize("spoil, said", [(spoil_vector, "vector: expected"), (spoil_number, "vector: expected"),
-                                         (widen_layer, "motion_2_w: .*10, 10.*10, 11"), (drop_layer, "cell_3_b")])
+@pytest.mark.parametrize("spoil, said", [
+    (lambda run: setattr(run, "vector", run.vector[:-1]), "vector: expected"),
+    (lambda run: run.vector.__setitem__(5, np.nan), "vector: expected"),
+    (lambda run: run.layout.update(motion_2_w=(10, 11)), "motion_2_w: .*10, 10.*10, 11"),
+    (lambda run: run.layout.pop("cell_3_b"), "cell_3_b")])
 def test_a_checkpoint_that_does_not_fit_names_what_differs(tmp_path, spoil, said):
     run, path = random_run(), tmp_path / "run.npz"
     spoil(run)
@@ -387,8 +289,3 @@ def test_a_checkpoint_of_another_camera_is_refused():
 def test_a_recipe_refuses(name, bad, said):
     with pytest.raises(ValueError, match=f"{name}: expected .*{said}"):
         Recipe(**{name: bad})
-
-
-def test_a_weight_of_an_unknown_term_is_refused():
-    with pytest.raises(ValueError, match="weights: expected some of the terms"):
-        train(tiny_pokes(), start_run(replace(TINY, weights={**WEIGHTS, "chamfre": 1.0}), tiny_pokes()))

@@ -6,6 +6,7 @@ import numpy as np
 from hind4sight_min.geometry import Camera
 from hind4sight_min.interactions import Interactions
 from hind4sight_min.networks import Sizes
+from hind4sight_min.sim.truth import Truth
 from hind4sight_min.training import Recipe, start_run
 
 SETTINGS = {"arena": 0.5, "cell": 0.025, "poke_length": [0.10, 0.14], "finger_radius": 0.01}
@@ -61,3 +62,10 @@ def doubled(batch):
         return replace(scene, points=scene.points.astype(float), images=scene.images.astype(float))
     return replace(batch, before=double(batch.before), after=double(batch.after), pokes=batch.pokes.astype(float),
                    evidence=tuple(value.astype(float) for value in batch.evidence))
+
+
+def still_truth(labels):
+    """The Truth of pokes with these labels (B, H, W) that move nothing; move its poses_after."""
+    poses = np.zeros((len(labels), 7, 7), np.float32)
+    poses[..., 6] = 1
+    return Truth(labels.astype(np.uint8), poses, poses.copy())
