@@ -45,7 +45,7 @@ OPENING = """\
 # Tutorials
 
 Each script below takes one idea of the model apart. Open it in an editor that knows `# %%` cells and step through it,
-or run it whole: `python tutorials/03_chamfer.py` prints what it finds, saves its pictures in `runs/tutorials` and ends
+or run it whole: `python tutorials/04_chamfer.py` prints what it finds, saves its pictures in `runs/tutorials` and ends
 with checks of its own, which stop it if something is wrong. `--show` opens the pictures, `--out` chooses another
 folder, `--quick` takes a smaller budget where there is something to save. They need no more than the package and the
 data that comes with it."""
@@ -64,8 +64,8 @@ them:
 
 ```
 pip install jupytext notebook
-jupytext --to notebook tutorials/03_chamfer.py   # writes tutorials/03_chamfer.ipynb
-jupyter notebook tutorials/03_chamfer.ipynb
+jupytext --to notebook tutorials/04_chamfer.py   # writes tutorials/04_chamfer.ipynb
+jupyter notebook tutorials/04_chamfer.ipynb
 ```
 
 Start it in the folder of the scripts, beside `lesson.py`. Notebooks are not kept in the repository; the scripts are
@@ -118,7 +118,7 @@ def parse(path):
     for name, pattern in PARTS.items():
         match = re.search(pattern, text, re.MULTILINE)
         if not match:
-            raise ValueError(f"{path.name}: its docstring lacks its {name}, or in the wrong form; see 03_chamfer.py")
+            raise ValueError(f"{path.name}: its docstring lacks its {name}, or in the wrong form; see 04_chamfer.py")
         parts[name] = match.group(1)
     equations = []
     for line in parts["equations"].replace("\n  ", " ").splitlines():  # a line may go on, indented

@@ -34,25 +34,25 @@ PLANTED = {
                         lambda right: lambda depth, camera: right(depth, replace(camera, cx=camera.cx + 0.5))),
     "02_rigid_motion": ("geometry", "so3_exp",  # the right rotation with half its gradient
                         lambda right: lambda twist: right(0.5 * twist + 0.5 * getval(twist))),
-    "03_chamfer": ("ops", "nearest_squared_distances",  # not squared
+    "04_chamfer": ("ops", "nearest_squared_distances",  # not squared
                    lambda right: lambda *args: right(*args) ** 0.5),
-    "04_warping": ("losses", "photometric_loss",  # pixels that are not valid count too
+    "05_warping": ("losses", "photometric_loss",  # pixels that are not valid count too
                    lambda right: lambda images, after, flow, valid: right(images, after, flow, np.ones_like(valid))),
-    "05_smoothness": ("losses", "flow_smoothness_loss",  # blind to the picture's edges
+    "06_smoothness": ("losses", "flow_smoothness_loss",  # blind to the picture's edges
                       lambda right: lambda flow, images, valid: right(flow, 0 * images, valid)),
-    "06_poke_simulator": ("interactions", "occupied_grid",  # x and y swapped
+    "07_poke_simulator": ("interactions", "occupied_grid",  # x and y swapped
                           lambda right: lambda *args: right(*args).swapaxes(1, 2)),
-    "07_networks": ("networks", "init_parameters",  # motions that do not start as the identity
+    "08_networks": ("networks", "init_parameters",  # motions that do not start as the identity
                     lambda right: lambda *args: {name: value + np.float32(0.1 * (name == "motion_3_b"))
                                                  for name, value in right(*args).items()}),
-    "08_training": ("training", "chunk_gradient",  # uphill
+    "10_training": ("training", "chunk_gradient",  # uphill
                     lambda right: lambda *args: (lambda terms, gradient: (terms, -gradient))(*right(*args))),
-    "09_evaluation": ("lab.evaluation", "poke_errors",  # directions that do not go round
+    "11_evaluation": ("lab.evaluation", "poke_errors",  # directions that do not go round
                       lambda right: lambda poke, true: (right(poke, true)[0], np.abs(poke[:, 2] - true[:, 2]))),
-    "10_planning": ("planning", "refit",  # directions averaged like numbers
+    "12_planning": ("planning", "refit",  # directions averaged like numbers
                     lambda right: lambda elites: (elites.mean(axis=0), elites.std(axis=0))),
 }
-CHANGED = {"10_planning": ("\nMOVERS = 1 ", "\nMOVERS = 3 ")}  # of "Now change this": the checks pass all the same
+CHANGED = {"12_planning": ("\nMOVERS = 1 ", "\nMOVERS = 3 ")}  # of "Now change this": the checks pass all the same
 
 
 def notices_a_planted_error(stem, out):

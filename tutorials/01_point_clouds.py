@@ -16,18 +16,6 @@ Last lines to expect:
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `geometry.unproject` and `geometry.project` are the two
 # functions of this lesson; with your editor's "go to definition" each is one click away.
-#
-# Ten lessons take the model apart. They, the code and the paper call things by the same names:
-#
-#     P_t, P_{t+1}, P'_{t+1}     point clouds before and after a poke, and the predicted one [m]; lessons 01, 02
-#     m^k, R_k, T_k              K masks, and the rotation and translation of each; 02, 07
-#     D_{P'->P}, D_{P->P'}       distance maps between the predicted and the observed cloud [m^2]; 03
-#     U, V                       optical flow, to the right and down [px]; 04
-#     I_t, I_{t+1}, I'_t         pictures before and after, in [0, 1], and I_{t+1} warped back; 04
-#     L_CD, L_rec, L_fs, L_ds    the losses of Eq. (2) to (5); 03, 04, 05
-#     u_t = (a_x, a_y, a_theta)  a poke: its target on the table [m], its direction [rad]; 06
-#     s_t                        state embedding; 07
-#     B, H, W, N, K, J           pokes, rows and columns of a picture, points (H W), masks, candidate plans
 
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
@@ -272,4 +260,4 @@ lesson.check("pixels without depth after the hole", int(np.sum(~holed_valid)), 1
 lesson.check("distance of a point without depth to the camera [m]",
              float(np.linalg.norm(holed[~holed_valid] - eye, axis=-1).max()), 0.0, within=1e-6)
 lesson.check("shift of the object's centre, invalid points left out / counted", masked_error / naive_error, below=0.2)
-print(f"{options.name}: all checks passed")
+lesson.end(options)

@@ -332,4 +332,4 @@ lesson.check("largest difference of Eq. (1) to the true scene flow [mm]", float(
 lesson.check("largest error of the turns found from zero [degrees]", float(np.abs(found_angles - true_angles).max()),
              below=0.1)
 lesson.check("half and half at 120 degrees, shrinks to cos 60", float(shrink[1]), 0.5, within=1e-9)
-print(f"{options.name}: all checks passed")
+lesson.end(options)

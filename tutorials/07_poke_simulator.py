@@ -11,15 +11,15 @@ Equations:
 - Sec. IV-B, the data set: `sim.collection.collect_shard`; tests/test_sim_collection.py
 - Sec. IV-C, true scene flow: `sim.truth.true_scene_flow`; tests/test_sim_truth.py
 
-Time: 5 s. Pictures: 06_film.png, 06_hindsight.png, 06_grid.png.
+Time: 5 s. Pictures: 07_film.png, 07_hindsight.png, 07_grid.png.
 
 Last lines to expect:
    median angle between an object's motion and the poke [degrees]: expected below 30, got 18.09
-06_poke_simulator: all checks passed
+07_poke_simulator: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. The arena lives in Bullet, a physics engine (Python
-# package pybullet). Where it is not installed, this tutorial uses the shipped pokes of data_small instead, and says
+# package pybullet). Where it is not installed, this lesson uses the shipped pokes of data_small instead, and says
 # so.
 
 # %%
@@ -40,7 +40,7 @@ from hind4sight_min.sim.collection import collect_shard
 from hind4sight_min.sim.truth import true_scene_flow
 from hind4sight_min.training import scenes_of
 
-options = lesson.begin("06_poke_simulator")
+options = lesson.begin("07_poke_simulator")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]
@@ -201,7 +201,7 @@ print(f"3. {len(recorded)} pokes: something moves in {np.mean(counts > 0):.0%}, 
 # Draw the motion of every object that moved as an arrow. In the arena's frame, left, there is no pattern: objects
 # lie anywhere and are pushed anywhere. Now turn and shift each poke so that its target is the origin and its
 # direction is the x axis, right: `geometry.poke_frame`. The pattern is plain, and it is the *same* for every poke.
-# The network reads the points in this frame (tutorial 07), so it need not learn each corner of the arena on its
+# The network reads the points in this frame (lesson 08), so it need not learn each corner of the arena on its
 # own.
 
 # %%
@@ -280,4 +280,4 @@ lesson.check("true flow of a point at (2, 0, 1) cm, distance to (8, 2, 0) cm [m]
 lesson.check("share of pokes that move something", float(np.mean(counts > 0)), above=0.8)
 lesson.check("median angle between an object's motion and the poke [degrees]", float(np.median(forwards[clear])),
              below=30)
-print(f"{options.name}: all checks passed")
+lesson.end(options)

@@ -10,11 +10,11 @@ Equations:
 - Sec. IV-C, the error on held-out pokes: `lab.evaluation.true_motion`, `lab.evaluation.matched_iou`;
   tests/test_evaluation.py
 
-Time: 20 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
+Time: 20 s. Pictures: 10_emergence.gif, 10_kink.png, 10_masks.png, 10_losses.png.
 
 Last lines to expect:
    held-out: IoU of the masks: expected above 0.4, got 0.6557
-08_training: all checks passed
+10_training: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. We train the whole model from scratch on the 400 pokes
@@ -36,7 +36,7 @@ from hind4sight_min.lab.evaluation import matched_iou, true_motion
 from hind4sight_min.lab.figures import PALETTE, TERMS, blend, flow_to_rgb
 from hind4sight_min.scene import crop, look
 
-options = lesson.begin("08_training")
+options = lesson.begin("10_training")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 train, _ = lesson.pokes("train")  # _ is the truth: training never sees it
@@ -324,7 +324,7 @@ heading = figure.suptitle("step 0", fontsize=11)
 figure.draw_without_rendering()
 figure.set_layout_engine("none")  # the layout of the first frame is that of all
 options.out.mkdir(parents=True, exist_ok=True)
-animation = options.out / "08_emergence.gif"
+animation = options.out / "10_emergence.gif"
 writer = PillowWriter(fps=4)
 with writer.saving(figure, animation, dpi=70):
     for at, masks, flow in snapshots + snapshots[-1:] * (0 if options.quick else 4):  # the last one stays for a while
@@ -397,4 +397,4 @@ lesson.check("cover of moving / of still points, fresh", float(on[0] / off[0]), 
 lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=2 if options.quick else 6)
 if not options.quick:
     lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.4)
-print(f"{options.name}: all checks passed")
+lesson.end(options)

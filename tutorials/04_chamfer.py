@@ -9,11 +9,11 @@ Equations:
 - Not in the paper, which points count: `losses.seen_in_both`; tests/test_eq2_chamfer.py
 - Sec. IV-B, depth noise: `lab.noise.add_depth_noise`; tests/test_noise.py
 
-Time: 3 s. Pictures: 03_maps.png, 03_gradient.png, 03_basin.png.
+Time: 3 s. Pictures: 04_maps.png, 04_gradient.png, 04_basin.png.
 
 Last lines to expect:
    angle of the summed pull to the true motion [degrees]: expected below 15, got 1.542
-03_chamfer: all checks passed
+04_chamfer: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `losses.distance_maps` is Eq. (2) as the package has it;
@@ -34,7 +34,7 @@ from hind4sight_min.lab.figures import PALETTE
 from hind4sight_min.lab.noise import add_depth_noise
 from hind4sight_min.training import scenes_of
 
-options = lesson.begin("03_chamfer")
+options = lesson.begin("04_chamfer")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]
@@ -220,4 +220,4 @@ lesson.check("Chamfer along the true flow / without motion", best / still, above
 lesson.check("scale at which the noise-free curve is lowest", float(scales[clean.argmin()]), 1.0, within=0.15)
 lesson.check("share of single arrows within 60 degrees of the true motion", share, above=0.3, below=0.9)
 lesson.check("angle of the summed pull to the true motion [degrees]", float(summed), below=15)
-print(f"{options.name}: all checks passed")
+lesson.end(options)
