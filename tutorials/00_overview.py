@@ -64,9 +64,11 @@ print("1. (a)", (np.ones((4, 1)) * np.ones(3)).shape, f" (b) {3.001 ** 2 - 3 ** 
 # ## One poke through the model
 #
 # The picture of docs/architecture.md: the functions of the package in the boxes, the shapes of what passes along the
-# arrows. The black labels say which lessons are about a box. They are read from the lessons' opening docstrings.
+# arrows. The black labels say which lessons are about a box; they are read from the lessons' opening docstrings. 01 is
+# inside of `scene.scene_of` and 03 inside of the losses; 11 and 12 begin where the picture ends.
 
 # %%
+print("2. The lessons about each box")
 architecture = lesson.architecture()
 FUNCTION = re.compile(r"\b[a-z]\w*\.[a-z_]\w*\b")
 named = {}  # function -> numbers of the lessons that are about it
@@ -75,7 +77,8 @@ for path in sorted((lesson.ROOT / "tutorials").glob("[0-9][0-9]_*.py")):
         for function in FUNCTION.findall(ast.get_docstring(ast.parse(path.read_text()))):
             named.setdefault(function, set()).add(path.name[:2])
 functions = {box: FUNCTION.findall(text) for box, (_, _, text, _) in architecture.BOXES.items()}
-where = {box: sorted(set().union(*(named.get(each, ()) for each in found))) for box, found in functions.items() if found}
+where = {box: sorted(set().union(*(named.get(each, ()) for each in found)))
+         for box, found in functions.items() if found}
 for box, numbers in where.items():
     print(f"   {' '.join(functions[box])}: {', '.join(numbers)}")
 lesson.keep(options, architecture.draw(badges={box: " ".join(numbers) for box, numbers in where.items() if numbers}),
@@ -118,9 +121,9 @@ shared = losses.seen_in_both(before.valid, after.valid, before.occupied, after.o
 maps = losses.distance_maps(answer.points, after.points, *shared)
 print("3. For one poke (B = 1)")
 for symbol, array, unit in (("I_t", before.images, ""), ("P_t", before.points, " m"), ("u_t", one.pokes, " m, m, rad"),
-                            ("m^k", answer.masks, ""), ("R_k", answer.rotations, ""), ("T_k", answer.translations, " m"),
-                            ("P'_{t+1}", answer.points, " m"), ("U, V", flow, " px"), ("I'_t", warped, ""),
-                            ("D_{P'->P}", maps[0], " m^2")):
+                            ("m^k", answer.masks, ""), ("R_k", answer.rotations, ""),
+                            ("T_k", answer.translations, " m"), ("P'_{t+1}", answer.points, " m"),
+                            ("U, V", flow, " px"), ("I'_t", warped, ""), ("D_{P'->P}", maps[0], " m^2")):
     print(f"   {symbol:10s} shape {str(array.shape):15s} from {array.min():8.2g} to {array.max():8.2g}{unit}")
 
 longest = max(1.0, np.linalg.norm(flow, axis=-1).max())  # px
@@ -129,7 +132,8 @@ figure, axes = plt.subplots(2, 4, figsize=(11, 5.3), layout="constrained")
 show_image(axes[0, 0], before.images[0], "$I_t$ and the poke $u_t$")
 draw_arrow(axes[0, 0], *on_table([pokes.starts[ROW], pokes.pokes[ROW, :2]], camera))
 show_image(axes[1, 0], after.images[0], "$I_{t+1}$")
-show_image(axes[0, 1], blend(before.images[0], answer.masks.reshape(*shape, -1)[..., 1:]), "masks $m^1, m^2$; grey: $m^0$")
+masks = answer.masks.reshape(*shape, -1)
+show_image(axes[0, 1], blend(before.images[0], masks[..., 1:]), "masks $m^1, m^2$; grey: $m^0$")
 show_image(axes[1, 1], np.clip(warped[0], 0, 1), "$I'_t$: $I_{t+1}$ warped back")
 show_image(axes[0, 2], flow_to_rgb(flow[0], longest), f"$(U, V)$, up to {longest:.0f} px")
 moves = np.flatnonzero(np.linalg.norm(scene_flow[0], axis=1) > 0.002)[::4]  # arrows of some of them
@@ -149,9 +153,9 @@ lesson.keep(options, figure, "symbols")
 # **Predict before you run:** if the prediction were perfect, which two of these pictures would look alike, and what
 # would the two on the right show?
 #
-# **Now change this:** swap the two ends of the motion, `geometry.optical_flow(answer.points, before.points, camera)`.
-# (U, V) then points backwards, and in I'_t the object lies on the wrong side of where it was. The Check "where the
-# flow says each point will appear" objects; nothing else knows the difference.
+# **Now change this:** `optical_flow(before.points, answer.points, camera)` to `optical_flow(answer.points,
+# before.points, camera)`. (U, V) then points backwards, and in I'_t the object lies on the wrong side of where it was.
+# The Check "where the flow says each point will appear" objects; nothing else knows the difference.
 
 # %% Check
 print("4. Check")
@@ -159,20 +163,21 @@ numbers = sorted(path.name[:2] for path in (lesson.ROOT / "tutorials").glob("[0-
 lesson.check("lessons, numbered without a gap", int(numbers == [f"{n:02d}" for n in range(13)]), 1, within=0)
 lesson.check("boxes of the architecture that no lesson is about", sum(not numbers for numbers in where.values()), 0,
              within=0)
-lesson.check("masks of a point, their sum, largest error", float(np.abs(answer.masks.sum(axis=2) - 1).max()), below=1e-5)
+lesson.check("masks of a point, their sum, largest error", float(np.abs(masks.sum(axis=2) - 1).max()), below=1e-5)
 v, u = np.mgrid[:shape[0], :shape[1]]
 lesson.check("where the flow says each point will appear, largest error [px]",
              float(np.abs(np.stack([u, v], axis=-1) + flow[0] - geometry.project(answer.points[0], camera).reshape(
                  *shape, 2)).max()), below=0.01)
 far = maps[0][0].argmax()
 squared = np.sum((after.points[0, shared[1][0]] - answer.points[0, far]) ** 2, axis=1)
-lesson.check("largest value of D_{P'->P} / the same by brute force", float(maps[0][0, far] / squared.min()), 1, within=1e-3)
+lesson.check("largest value of D_{P'->P} / the same by brute force", float(maps[0][0, far] / squared.min()), 1,
+             within=1e-3)
 lesson.end(options)
 
 # %% [markdown]
 # ## Answers
 #
-# 1. (a) (4, 3): an axis of length 1 is repeated, a missing one is added in front. (b) By 0.006: the slope of x^2 at 3 is
-#    2 * 3, times 0.001. (c) To (0, 1, 0).
+# 1. (a) (4, 3): an axis of length 1 is repeated, a missing one is added in front. (b) By 0.006: the slope of x^2 at 3
+#    is 2 * 3, times 0.001. (c) To (0, 1, 0).
 # 2. I'_t would look like I_t, wherever both pictures show the same. The distance maps would be dark everywhere: each
 #    predicted point would lie on an observed one, and the other way round.

@@ -158,8 +158,8 @@ lesson.keep(options, figure, "mistakes")
 # ## How small is "a little"?
 #
 # The step h can be too large, because a slope is a limit, and too small, because the difference of two nearly equal
-# numbers has few digits left. Central differences are exact up to h^2, one-sided ones, (L(x + h) - L(x)) / h, only up to
-# h: the slope of sin at 1, measured with both.
+# numbers has few digits left. Central differences are exact up to h^2, one-sided ones, (L(x + h) - L(x)) / h, only up
+# to h: the slope of sin at 1, measured with both.
 #
 # And some places have no slope. At a whole x, `read` has a kink: one slope to the left, another to the right. Central
 # differences return their mean, a VJP one of the two, and neither is wrong. Test beside kinks, not on them. (Distances
@@ -178,8 +178,8 @@ print("3. Best step: " + ", ".join(f"{name} {step:.0e}" for name, step in best.i
 kink = np.array([3.0])
 left, right = row[3] - row[2], row[4] - row[3]
 mean_slope = slopes(lambda: read(row, kink)[0], kink)[0]
-print(f"   at the kink x = 3: slope {left:.2f} to the left, {right:.2f} to the right, central difference {mean_slope:.2f}, "
-      f"VJP {read_vjp(np.ones(1), row, kink)[1][0]:.2f}")
+print(f"   at the kink x = 3: slope {left:.2f} to the left, {right:.2f} to the right, central difference "
+      f"{mean_slope:.2f}, VJP {read_vjp(np.ones(1), row, kink)[1][0]:.2f}")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
 for (name, values), colour, style in zip(errors_of_step.items(), PALETTE[[0, 5, 6]], ("-.", "-", "--")):
@@ -227,9 +227,9 @@ for _ in range(50):
 print(f"4. Moved by 2.3 px; gradient descent finds {U:.3f}")
 
 # %% [markdown]
-# **Now change this:** in `read_vjp`, which is what autograd was given, write `on_row[i] += g * (1 - w)` for the first
-# `np.add.at`. Gradient descent finds the same U as before, because it never asks for the row's gradient: a wrong
-# derivative can sit unnoticed for years. The Checks "right VJP, hard test" and "given to autograd" object.
+# **Now change this:** `np.add.at(on_row, i, g * (1 - w))` to `on_row[i] += g * (1 - w)`. Gradient descent finds the
+# same U as before, because it never asks for the row's gradient: a wrong derivative can sit unnoticed for years. The
+# Checks "right VJP, hard test" and "given to autograd" object.
 
 # %% Check
 print("5. Check")

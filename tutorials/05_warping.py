@@ -285,11 +285,12 @@ lesson.keep(options, figure, "gradient")
 
 # %% [markdown]
 # So the two losses divide the work. (At no motion at all something else happens, and a little noise on the images
-# helps: `training.Recipe.image_noise`, tutorial 10.)
+# helps: `training.Recipe.image_noise`, lesson 10.)
 #
-# **Now change this:** set `ROW = 173`. The lowest photometric loss is then in a corner of the landscape, far from the
-# truth, and a check fails. What happens to the object's pixels there? (Look at `in_view`.) And what would a network
-# learn from that term alone?
+# **Now change this:** `ROW = 158` to `ROW = 173`. The lowest photometric loss is then in a corner of the landscape, 11
+# cm from the truth: more than half of the object's pixels read outside of the picture there, where nothing is compared
+# and nothing costs (`in_view`). From that term alone, a network could learn to throw things out of sight. The Check
+# "offset of the lowest photometric loss" objects.
 
 # %% Check
 print("7. Check")
@@ -321,8 +322,15 @@ lesson.check("number of minima, stripes", len(lows["stripes"]), 3, within=0)
 lowest = np.unravel_index(landscape[..., 0].argmin(), landscape.shape[:2])
 lesson.check("offset of the lowest photometric loss [cm]", 100 * float(np.hypot(*offsets[list(lowest)])), 0.0,
              within=0.8)
-lesson.check("basin of the photometric loss, share of the offsets", shares[0], above=0, below=0.15)
+lesson.check("basin of the photometric loss, share of the offsets", shares[0], above=0, below=0.25)
 lesson.check("basin of the Chamfer distance", shares[1], above=0.8)
 lesson.check("share of photometric gradients that point the right way at 5 mm", float(right_way[1, 0]), above=0.8)
 lesson.check("the same at 5 cm", float(right_way[7, 0]), below=0.7)
 lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. Neither. The basin is a spot around the truth, about as wide as a stripe; no motion lies far outside. From 5 cm
+#    away the gradient of the colours is little better than a random direction, while Chamfer's still points the right
+#    way.

@@ -151,9 +151,9 @@ figure.suptitle("Steps are nearly free at the object's rim and stripes (dark) an
 lesson.keep(options, figure, "flows")
 
 # %% [markdown]
-# No motion is the cheapest: nothing is smoother than nothing. So Eq. (4) must never be strong enough to win against the
-# other losses. It is there to decide between flows that the others find alike, such as the true one and the spilled
-# one: plain table looks the same when it is shifted by a pixel or two.
+# Eq. (4) must never be strong enough to win against the other losses. It is there to decide between flows that the
+# others find alike, such as the true one and the spilled one: plain table looks the same when it is shifted by a pixel
+# or two.
 #
 # ## How sharp should the weight be?
 #
@@ -329,8 +329,9 @@ lesson.keep(options, figure, "holes")
 # package the smoothness terms speak softly: L_CD and L_rec pay most for a hole. The smoothness terms decide where those
 # two find two flows alike.
 #
-# **Now change this:** let the group be pokes of 5 to 9 cm instead of 1 to 3 (`0.05 < candidate.motion < 0.09`). The
-# objects then hardly overlap with where they were. What happens to the factor of L_CD, and why? (A check will fail.)
+# **Now change this:** `0.01 < candidate.motion < 0.03` to `0.05 < candidate.motion < 0.09`. These objects hardly
+# overlap with where they were, so a core that is left behind finds no close neighbours, and a hole raises L_CD by much
+# more. The Check "median factor of L_CD with a hole" objects.
 
 # %% Check
 print("7. Check")
@@ -364,3 +365,9 @@ lesson.check("on the object without the weights", float(left_over["without edges
 lesson.check("median factor of L_CD with a hole", float(medians[0, 0]), above=1.1, below=1.8)
 lesson.check("share of pokes in which the factor of L_ds is larger", wins, above=0.7)
 lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. No motion, then the true flow, the spilled one, the noisy one. Nothing is smoother than nothing, which is why Eq.
+#    (4) alone would teach a model to move nothing.

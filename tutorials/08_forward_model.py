@@ -56,7 +56,7 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 # 3 masks each. What is narrow runs on every point, what is wide once per poke or mask.
 
 # %%
-lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "architecture", dpi=70)
+lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "architecture", dpi=85)
 
 # %% [markdown]
 # ## A perceptron that knows no pixels
@@ -187,9 +187,9 @@ figure.suptitle("One scene, four imagined pokes: the masks and the predicted mot
 lesson.keep(options, figure, "what_if")
 
 # %% [markdown]
-# **Now change this:** let the four pokes miss: `pokes = np.column_stack([objects[:, :2] + 0.12, angles])`, 12 cm off in x
-# and y. Most masks vanish, and where a poke happens to end near another object, that one gets the mask. The Check
-# "imagined pokes: mean mask on the object that is poked" objects.
+# **Now change this:** `np.column_stack([objects[:, :2], angles])` to `np.column_stack([objects[:, :2] + 0.12,
+# angles])`: all four pokes miss by 12 cm in x and in y. Most masks vanish, and where a poke happens to end near another
+# object, that one gets the mask. The Check "imagined pokes: mean mask on the object that is poked" objects.
 
 # %% Check
 print("5. Check")
@@ -231,6 +231,6 @@ lesson.end(options)
 # %% [markdown]
 # ## Answers
 #
-# 1. A little more than half: e^0 / (e^0 + 2 e^-1) = 0.58. Not all of it: a mask of nothing could not learn, for whatever
-#    its motion does, nothing changes. It moves nothing, as all its motions are the identity.
+# 1. A little more than half: e^0 / (e^0 + 2 e^-1) = 0.58. Not all of it: a mask of nothing could not learn, for
+#    whatever its motion does, nothing changes. It moves nothing, as all its motions are the identity.
 # 2. No. The masks are a function of the cloud *and of the poke*: they say what this poke will move.

@@ -52,6 +52,7 @@ ROW = 1
 # of the arena's grid: where the finger started, and its target. `scene.most_changed` picks the points that
 # changed most; everything is said relative to their centre, so that a poke learnt in one corner is known in all.
 # The loss of a heat-map, L_act, is its cross entropy: minus the logarithm of the probability at the true cell.
+# The other half of the inverse loss, L_sim, wants the state embedding of P'_{t+1} to be that of P_{t+1}.
 #
 # **Predict before you run:** there are 400 cells. What does a heat-map cost that knows nothing? And which of the two
 # will be the harder to tell, the start or the target?
@@ -178,9 +179,10 @@ lesson.keep(options, figure, "gradients")
 # docs/research-log.md tells what this audit was good for: weights that looked harmless by their values let flow
 # smoothness pull harder than the Chamfer distance, and the predictions got worse as it was switched on.
 #
-# **Now change this:** set `KICK = 0.05`. The fresh motions are then no longer the identity, and all layers get a gradient
-# in the first step; the Check "first step: largest gradient of another layer" objects. You would still rather start
-# from the identity: look at the longest motion that the network now predicts before it has learnt anything.
+# **Now change this:** `KICK = 0.0` to `KICK = 0.05`. The fresh motions are then no longer the identity, and all layers
+# get a gradient in the first step; the Check "first step: largest gradient of another layer" objects. You would still
+# rather start from the identity: look at the longest motion that the network now predicts before it has learnt
+# anything.
 
 # %% Check
 print("4. Check")
@@ -219,7 +221,7 @@ lesson.end(options)
 #
 # 1. log(400) = 5.99 nats: every cell has the probability 1/400. The start is harder: the target lies at what moved, but
 #    of the start only the direction shows, not how far off the finger came down.
-# 2. One layer, the last of the motions. While all motions are the same, Eq. (1) gives the same points whatever the masks;
-#    and the last layer's weights are 0, so nothing passes through it to the layers below. What is left of the others'
-#    gradients is rounding. One step later the motions differ from "stay", and everything learns. This is why Sec.
-#    III-G's start is a good one: the first thing that can happen is that something moves.
+# 2. One layer, the last of the motions. While all motions are the same, Eq. (1) gives the same points whatever the
+#    masks; and the last layer's weights are 0, so nothing passes through it to the layers below. What is left of the
+#    others' gradients is rounding. One step later the motions differ from "stay", and everything learns. This is why
+#    Sec. III-G's start is a good one: the first thing that can happen is that something moves.
