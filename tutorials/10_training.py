@@ -14,7 +14,7 @@ Time: 20 s. Pictures: 10_emergence.gif, 10_kink.png, 10_masks.png, 10_losses.png
 10_valley.png.
 
 Last lines to expect:
-   held-out: IoU of the masks: expected above 0.4, got 0.6557
+   held-out: IoU of the masks: expected above 0.3, got 0.6384
 10_training: all checks passed
 """
 # %% [markdown]
@@ -390,7 +390,10 @@ lesson.say_where(animation)
 # In the second row the mask keeps to the part of the object near the target. 400 pokes and some hundred steps are
 # little; the shipped checkpoint had many more of both, and its ratio on the same pokes is printed above.
 #
-# **Now change this:** `training.Recipe(steps=200)` to `training.Recipe(steps=200, image_noise=0.0)`. TODO
+# **Now change this:** `training.Recipe(steps=200)` to `training.Recipe(steps=200, image_noise=0.0)`, and do not use
+# --quick. No motion is then a minimum of the photometric loss, and the Check "with noise: loss of the best shift
+# forwards" objects. The other losses pull the network out of it all the same, and its ratio comes out a little worse.
+# With `optimiser="adam"` instead, no Check objects; the ratio, too, comes out a little worse, and the masks clearly so.
 
 # %% Check
 print("6. Check")
@@ -438,9 +441,9 @@ lesson.check("held-out: ratio before training", float(ratio[0]), 1, within=1e-3)
 lesson.check("held-out: ratio at the end", float(ratio[-1]), below=0.85 if options.quick else 0.45)
 lesson.check("animation [kB]", animation.stat().st_size / 1000, above=10, below=400)
 lesson.check("cover of moving / of still points, fresh", float(on[0] / off[0]), 1, within=0.25)
-lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=2 if options.quick else 6)
+lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=1.5 if options.quick else 4)
 if not options.quick:
-    lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.4)
+    lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.3)
 lesson.end(options)
 
 # %% [markdown]

@@ -41,7 +41,7 @@ from hind4sight_min.networks import predict
 options = lesson.begin("11_evaluation")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
-POKES = 30 if options.quick else 60
+POKES = 20 if options.quick else 60
 data, truth = (part[np.arange(POKES)] for part in lesson.pokes())
 run = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 errors = [evaluation.errors_of_poke(run, data, truth, row) for row in range(POKES)]  # a dict for each poke
