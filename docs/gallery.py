@@ -45,12 +45,12 @@ EQUATION = re.compile(r"- (?P<what>.+?): (?P<functions>`[\w.]+`(?:, `[\w.]+`)*);
 OPENING = """\
 # The lessons
 
-Each script below takes one idea of the model apart; the first says why in this order, and what to know before. Open it
-in an editor that knows `# %%` cells and step through it, or run it whole: `python tutorials/04_chamfer.py` prints what
-it finds, saves its pictures in `runs/tutorials` and ends with checks of its own, which list what is wrong. Each asks for
-a prediction before it shows the answer, and proposes a change and says which check will object. `--show` opens the
-pictures, `--out` chooses another folder, `--quick` takes a smaller budget where there is something to save. They need
-no more than the package and the data that comes with it."""
+Each script below takes one idea of the model apart; the first says why in this order, and what to know before. Open
+it in an editor that knows `# %%` cells and step through it, or run it whole: `python tutorials/04_chamfer.py`
+prints what it finds, saves its pictures in `runs/tutorials` and ends with checks of its own, which list what is
+wrong. Each asks for a prediction before it shows the answer, and proposes a change and says which check will
+object. `--show` opens the pictures, `--out` chooses another folder, `--quick` takes a smaller budget where there is
+something to save. They need no more than the package and the data that comes with it."""
 
 MAP = """\
 ## From the paper's equations to the code

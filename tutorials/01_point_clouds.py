@@ -235,10 +235,10 @@ figure.suptitle("A pixel without depth is a point at the camera, and drags every
 lesson.keep(options, figure, "missing")
 
 # %% [markdown]
-# **Now change this:** `[:15]] = 0` to `[:15]] = np.nan`, another sign for "missing". These pixels are still not valid,
-# because `depth > 0` is false for NaN as well. Yet the centre of the *valid* points becomes NaN, as NaN times a weight
-# of 0 is NaN. (A missing depth of 0 is wrong but finite, and a weight of 0 takes it out of every sum.) The Checks
-# "distance of a point without depth to the camera" and "shift of the object's centre" object.
+# **Now change this:** `[:15]] = 0` to `[:15]] = np.nan`, another sign for what is missing. These pixels are still not
+# valid, because `depth > 0` is false for NaN as well. Yet the centre of the *valid* points becomes NaN, as NaN times a
+# weight of 0 is NaN. (A missing depth of 0 is wrong but finite, and a weight of 0 takes it out of every sum.) The
+# Checks "distance of a point without depth to the camera" and "shift of the object's centre" object.
 
 # %% Check
 print("6. Check")
