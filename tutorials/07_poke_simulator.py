@@ -284,5 +284,5 @@ lesson.end(options)
 # %% [markdown]
 # ## Answers
 #
-# 1. In nearly all of them something moves, in about one of ten two objects or more. A target drawn from all cells
-#    would nearly always be bare table; that is what background subtraction is for.
+# 1. In nearly all of them something moves, in about one of ten two objects or more. A target drawn from all cells would
+#    nearly always be bare table; that is what background subtraction is for.

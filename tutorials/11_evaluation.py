@@ -228,8 +228,8 @@ lesson.keep(options, figure, "ablation")
 #
 # **Now change this:** `NOISE = "clean"` to `NOISE = "noisy"`, which trains and evaluates with 1 cm of depth noise. No
 # Check objects: smoothing takes out most of the noise, the models come out much as before, and the 3D terms alone do
-# not fail as they do in the paper's Table I. At 1 cm the shipped model, which saw no noise in training, is still far
-# better than all of them. This budget cannot tell what noise does to training in the end.
+# not fail as they do in the paper's Table I. At 1 cm the shipped model, which saw no noise in training, is still
+# clearly better than all of them. This budget cannot tell what noise does to training in the end.
 
 # %% Check
 print("5. Check")
