@@ -95,22 +95,34 @@ def check_names():
                 getattr(importlib.import_module(f"hind4sight_min.{module}"), name)
 
 
-def draw():
+WHOLE = (-1.3, 26.4, -0.1, 11.3)
+
+
+def draw(view=WHOLE, badges=None):
+    """The boxes in a view (left, right, bottom, top), some with a badge, {name of the box: text} -> Figure."""
     check_names()
     shapes = measured_shapes()
-    figure = Figure(figsize=(19, 8.4), dpi=85)
+    left, right, bottom, top = view
+    figure = Figure(figsize=(19 / 27.7 * (right - left), 8.4 / 11.4 * (top - bottom)), dpi=85)
     axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(-1.3, 26.4), ylim=(-0.1, 11.3))
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.axis("off")
     halves = {}
     for name, (x, y, text, colour) in BOXES.items():
+        if not (left < x < right and bottom < y < top):
+            continue
         lines = text.replace("$", "").replace("\\", "").split("\n")
         halves[name] = np.array([0.25 + 0.068 * max(map(len, lines)), 0.17 * len(lines) + 0.17])
         width, height = 2 * halves[name]
         axes.add_patch(FancyBboxPatch((x - width / 2, y - height / 2), width, height, boxstyle="round,pad=0.04",
                                       facecolor=colour, edgecolor="0.3", zorder=3))
         axes.text(x, y, text, ha="center", va="center", fontsize=10.5, zorder=4)
+        if badges and name in badges:
+            axes.text(x - width / 2, y + height / 2 + 0.1, badges[name], ha="left", va="center", fontsize=13, zorder=6,
+                      color="white", bbox=dict(boxstyle="round,pad=0.25", facecolor="black", edgecolor="white"))
     for start, end, key in ARROWS:
+        if start not in halves or end not in halves:
+            continue
         a, b = (np.array(BOXES[name][:2], float) for name in (start, end))
         along = b - a
         leave, arrive = (np.min((halves[name] + 0.06) / np.maximum(np.abs(along), 1e-9)) for name in (start, end))
@@ -122,6 +134,8 @@ def draw():
                   zorder=5, bbox=dict(facecolor="white", edgecolor="none", pad=0.5, alpha=0.85 * (not level)))
     for x, y, text in NOTES:
         axes.text(x + 0.15, y, text, fontsize=9, color="0.3", ha="center")
+    if view != WHOLE:
+        return figure
     axes.text(-1, 10.85, "One poke through the model: functions of hind4sight_min in the boxes, shapes on the arrows (of one "
               "poke; everything has a batch axis B before it).", fontsize=13)
     axes.text(-1, 10.4, "64 x 48 pixels are 3,072 points; 116 of this poke's stand out near its end. Grey: what is seen. "

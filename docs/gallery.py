@@ -1,11 +1,11 @@
-"""The tutorials at a glance: run them all and write docs/gallery.md with their pictures.
+"""The lessons at a glance: run them all and write docs/gallery.md with their pictures.
 
     python docs/gallery.py
     python docs/gallery.py --text
 
 The first runs every script of tutorials/, two at a time, and makes docs/gallery/ from the first two pictures each of
 them names; a minute or two. The second leaves the pictures as they are. Everything that docs/gallery.md says about a
-tutorial comes from the script's opening docstring, read without running it; a test fails while the page says anything
+lesson comes from the script's opening docstring, read without running it; a test fails while the page says anything
 else.
 """
 import ast
@@ -27,7 +27,8 @@ from hind4sight_min.disk.files import whole_file, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 TUTORIALS, PAGE, PICTURES = ROOT / "tutorials", ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery"
-SHOWN, WIDTH, LARGEST_GIF = 2, 800, 400_000  # pictures per tutorial, px, bytes
+SHOWN, WIDTH, LARGEST_GIF = 2, 800, 400_000  # pictures per lesson, px, bytes
+DIAGRAM = 1200  # px; what is wider is text in boxes and would be unreadable made small
 
 # what a tutorial's docstring consists of, in this order
 PARTS = {
@@ -42,18 +43,19 @@ EQUATION = re.compile(r"- (?P<what>.+?): (?P<functions>`[\w.]+`(?:, `[\w.]+`)*);
                       r"(?:, tests/\w+\.py)*)")
 
 OPENING = """\
-# Tutorials
+# The lessons
 
-Each script below takes one idea of the model apart. Open it in an editor that knows `# %%` cells and step through it,
-or run it whole: `python tutorials/03_chamfer.py` prints what it finds, saves its pictures in `runs/tutorials` and ends
-with checks of its own, which stop it if something is wrong. `--show` opens the pictures, `--out` chooses another
-folder, `--quick` takes a smaller budget where there is something to save. They need no more than the package and the
-data that comes with it."""
+Each script below takes one idea of the model apart; the first says why in this order, and what to know before. Open
+it in an editor that knows `# %%` cells and step through it, or run it whole: `python tutorials/04_chamfer.py`
+prints what it finds, saves its pictures in `runs/tutorials` and ends with checks of its own, which list what is
+wrong. Each asks for a prediction before it shows the answer, and proposes a change and says which check will
+object. `--show` opens the pictures, `--out` chooses another folder, `--quick` takes a smaller budget where there is
+something to save. They need no more than the package and the data that comes with it."""
 
 MAP = """\
 ## From the paper's equations to the code
 
-Every equation and section that a tutorial is about, the functions that compute it, the files that test them, and where
+Every equation and section that a lesson is about, the functions that compute it, the files that test them, and where
 to step through them."""
 
 NOTEBOOKS = """\
@@ -64,8 +66,8 @@ them:
 
 ```
 pip install jupytext notebook
-jupytext --to notebook tutorials/03_chamfer.py   # writes tutorials/03_chamfer.ipynb
-jupyter notebook tutorials/03_chamfer.ipynb
+jupytext --to notebook tutorials/04_chamfer.py   # writes tutorials/04_chamfer.ipynb
+jupyter notebook tutorials/04_chamfer.ipynb
 ```
 
 Start it in the folder of the scripts, beside `lesson.py`. Notebooks are not kept in the repository; the scripts are
@@ -118,7 +120,7 @@ def parse(path):
     for name, pattern in PARTS.items():
         match = re.search(pattern, text, re.MULTILINE)
         if not match:
-            raise ValueError(f"{path.name}: its docstring lacks its {name}, or in the wrong form; see 03_chamfer.py")
+            raise ValueError(f"{path.name}: its docstring lacks its {name}, or in the wrong form; see 04_chamfer.py")
         parts[name] = match.group(1)
     equations = []
     for line in parts["equations"].replace("\n  ", " ").splitlines():  # a line may go on, indented
@@ -195,11 +197,11 @@ def equation_map(found):
                       ", ".join(link(source_of(name), f"`{name}`") for name in functions),
                       ", ".join(link(name, f"`{Path(name).name}`") for name in tests),
                       ", ".join(link(f"tutorials/{name}", name[:2]) for name in scripts)])
-    return table(["paper", "functions", "tests", "tutorial"], lines)
+    return table(["paper", "functions", "tests", "lesson"], lines)
 
 
 def page(found):
-    order = table(["", "tutorial", "time"],
+    order = table(["", "lesson", "time"],
                   [[link(f"tutorials/{each.path.name}", each.number), each.title, each.time] for each in found])
     parts = [OPENING, "Read them in this order; each also stands on its own.\n\n" + order, *map(section, found),
              MAP + "\n\n" + equation_map(found), NOTEBOOKS]
@@ -231,7 +233,7 @@ def small(path):
         return path.read_bytes()
     picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
     height, width = picture.shape[:2]
-    if width > WIDTH:
+    if WIDTH < width <= DIAGRAM:
         picture = cv2.resize(picture, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
     stream = io.BytesIO()
     Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)

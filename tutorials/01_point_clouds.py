@@ -16,18 +16,6 @@ Last lines to expect:
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `geometry.unproject` and `geometry.project` are the two
 # functions of this lesson; with your editor's "go to definition" each is one click away.
-#
-# Ten lessons take the model apart. They, the code and the paper call things by the same names:
-#
-#     P_t, P_{t+1}, P'_{t+1}     point clouds before and after a poke, and the predicted one [m]; lessons 01, 02
-#     m^k, R_k, T_k              K masks, and the rotation and translation of each; 02, 07
-#     D_{P'->P}, D_{P->P'}       distance maps between the predicted and the observed cloud [m^2]; 03
-#     U, V                       optical flow, to the right and down [px]; 04
-#     I_t, I_{t+1}, I'_t         pictures before and after, in [0, 1], and I_{t+1} warped back; 04
-#     L_CD, L_rec, L_fs, L_ds    the losses of Eq. (2) to (5); 03, 04, 05
-#     u_t = (a_x, a_y, a_theta)  a poke: its target on the table [m], its direction [rad]; 06
-#     s_t                        state embedding; 07
-#     B, H, W, N, K, J           pokes, rows and columns of a picture, points (H W), masks, candidate plans
 
 # %%
 import lesson  # first of all: it sets the number of BLAS threads
@@ -110,9 +98,8 @@ figure.suptitle("Depth mostly says how far down the table a pixel is; the arena'
 lesson.keep(options, figure, "views")
 
 # %% [markdown]
-# Along a row the depth is the same everywhere: the camera is not tilted sideways, so a row of table points is parallel
-# to the picture. Along a column it grows towards the far wall. The *distance* to the camera would grow along the row
-# too, towards both its ends. Taking one for the other is a common mistake, and a flat table shows it at once.
+# Depth is not distance: the *distance* to the camera would grow along the row, too, towards both its ends. Taking one
+# for the other is a common mistake, and a flat table shows it at once.
 #
 # ## A flat table is a test of the camera
 #
@@ -202,7 +189,10 @@ lesson.keep(options, figure, "other")
 # the pixels of one object lose their depth. A depth of 0 becomes a point *at the camera*: finite numbers, far from
 # where they belong. Nothing fails; averages just go wrong. So the package carries the validity mask along with every
 # cloud, and counts a point only where the mask is true. Here the centre of one object, a mean of points under a mask,
-# as the forward model takes the centre of each of its masks, with and without validity:
+# as the forward model takes the centre of each of its masks, with and without validity.
+#
+# **Predict before you run:** the object covers 53 pixels, and the camera is 77 cm away from it. By about how much does
+# the centre move if 15 of the points lie at the camera?
 
 # %%
 label = np.argmax(np.bincount(truth.labels[ROW].ravel())[1:]) + 1  # the object that covers most pixels
@@ -245,9 +235,10 @@ figure.suptitle("A pixel without depth is a point at the camera, and drags every
 lesson.keep(options, figure, "missing")
 
 # %% [markdown]
-# **Now change this:** punch the hole with `np.nan` instead of 0. Its pixels are still not valid, because `depth > 0`
-# is false for NaN as well. Yet the centre of the *valid* points becomes NaN, and the checks fail: why? Multiply a NaN
-# by a weight of 0. A missing depth of 0 is wrong but finite, and a weight of 0 takes it out of every sum.
+# **Now change this:** `[:15]] = 0` to `[:15]] = np.nan`, another sign for what is missing. These pixels are still not
+# valid, because `depth > 0` is false for NaN as well. Yet the centre of the *valid* points becomes NaN, as NaN times a
+# weight of 0 is NaN. (A missing depth of 0 is wrong but finite, and a weight of 0 takes it out of every sum.) The
+# Checks "distance of a point without depth to the camera" and "shift of the object's centre" object.
 
 # %% Check
 print("6. Check")
@@ -272,4 +263,12 @@ lesson.check("pixels without depth after the hole", int(np.sum(~holed_valid)), 1
 lesson.check("distance of a point without depth to the camera [m]",
              float(np.linalg.norm(holed[~holed_valid] - eye, axis=-1).max()), 0.0, within=1e-6)
 lesson.check("shift of the object's centre, invalid points left out / counted", masked_error / naive_error, below=0.2)
-print(f"{options.name}: all checks passed")
+lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. Along a row it is the same everywhere: the camera is not tilted sideways, so a row of table points is parallel to
+#    the picture. Along a column it grows towards the far wall.
+# 2. By 15/53 of the way to the camera, some 22 cm. Leaving the 15 points out costs a few millimetres, as they were the
+#    object's far end.

@@ -196,9 +196,8 @@ print("4. Blended half and half with the identity, a turn by", *blend_angles, "d
       *np.round(shrink, 3))
 
 # %% [markdown]
-# In the plane of the turn, the mean of the identity and a turn by t is a turn by t / 2 times cos(t / 2): at 180 degrees
-# every point lands on the axis. So an object that turns cannot be described by a mask of 0.5, whatever its motion: the
-# prediction is smaller than the object. No term of the loss asks for crisp masks, but a true prediction needs them.
+# So an object that turns cannot be described by a mask of 0.5, whatever its motion: the prediction is smaller than the
+# object. No term of the loss asks for crisp masks, but a true prediction needs them.
 #
 # ## Why an angle of zero needs care
 #
@@ -305,10 +304,10 @@ figure.suptitle("so3_exp keeps its digits down to zero, so an optimiser can star
 lesson.keep(options, figure, "zero")
 
 # %% [markdown]
-# **Now change this:** in `moved_by`, use the mended formula: `rotations = anp.stack([typed_in(w, mend=True) for w in
-# twists[:, :3]])`. The optimiser never leaves zero, and the check of the turns fails. Then let `path` begin with
-# `np.full(6 * len(movers), 0.001)` instead of zeros: it arrives as before. Such an error stays hidden until somebody
-# starts where Sec. III-G says.
+# **Now change this:** `rotations = geometry.so3_exp(twists[:, :3])` to `rotations = anp.stack([typed_in(w, mend=True)
+# for w in twists[:, :3]])`. The optimiser never leaves zero, and the Check "largest error of the turns found from zero"
+# objects. Then let `path` begin with `np.full(6 * len(movers), 0.001)` instead of zeros: it arrives as before. Such an
+# error stays hidden until somebody starts where Sec. III-G says.
 
 # %% Check
 print("7. Check")
@@ -332,4 +331,10 @@ lesson.check("largest difference of Eq. (1) to the true scene flow [mm]", float(
 lesson.check("largest error of the turns found from zero [degrees]", float(np.abs(found_angles - true_angles).max()),
              below=0.1)
 lesson.check("half and half at 120 degrees, shrinks to cos 60", float(shrink[1]), 0.5, within=1e-9)
-print(f"{options.name}: all checks passed")
+lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. Onto the axis. In the plane of the turn, the mean of the identity and a turn by t is a turn by t / 2 times cos(t /
+#    2), and cos(90 degrees) is 0.

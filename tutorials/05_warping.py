@@ -9,11 +9,11 @@ Equations:
   tests/test_ops.py
 - Eq. (3), photometric loss: `losses.photometric_loss`, `losses.seen_in_both`; tests/test_eq3_photometric.py
 
-Time: 6 s. Pictures: 04_warp.png, 04_basin.png, 04_stripes.png, 04_gradient.png.
+Time: 6 s. Pictures: 05_warp.png, 05_basin.png, 05_stripes.png, 05_gradient.png.
 
 Last lines to expect:
    the same at 5 cm: expected below 0.7, got 0.3125
-04_warping: all checks passed
+05_warping: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `losses.photometric_loss` is Eq. (3) as the package has it;
@@ -32,7 +32,7 @@ from hind4sight_min.lab.evaluation import true_motion
 from hind4sight_min.lab.figures import PALETTE, colour_wheel, flow_to_rgb
 from hind4sight_min.training import scenes_of
 
-options = lesson.begin("04_warping")
+options = lesson.begin("05_warping")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]
@@ -193,7 +193,7 @@ lesson.keep(options, figure, "stripes")
 # ## The landscape of a real poke
 #
 # Move the object by its true motion plus an *offset* on the table, up to 8 cm each way, and draw both losses: the
-# photometric one and the Chamfer distance of lesson 03. Offset 0 is the truth. From every offset, walk to the lowest
+# photometric one and the Chamfer distance of lesson 04. Offset 0 is the truth. From every offset, walk to the lowest
 # neighbour until none is lower. The *basin* of the truth is where such a walk ends within 1 cm of it.
 #
 # **Predict before you run:** "no motion", where every network starts, lies 7 cm from the truth. Is it in the basin of
@@ -285,11 +285,12 @@ lesson.keep(options, figure, "gradient")
 
 # %% [markdown]
 # So the two losses divide the work. (At no motion at all something else happens, and a little noise on the images
-# helps: `training.Recipe.image_noise`, tutorial 08.)
+# helps: `training.Recipe.image_noise`, lesson 10.)
 #
-# **Now change this:** set `ROW = 173`. The lowest photometric loss is then in a corner of the landscape, far from the
-# truth, and a check fails. What happens to the object's pixels there? (Look at `in_view`.) And what would a network
-# learn from that term alone?
+# **Now change this:** `ROW = 158` to `ROW = 173`. The lowest photometric loss is then in a corner of the landscape, 11
+# cm from the truth: more than half of the object's pixels read outside of the picture there, where nothing is compared
+# and nothing costs (`in_view`). From that term alone, a network could learn to throw things out of sight. The Check
+# "offset of the lowest photometric loss" objects.
 
 # %% Check
 print("7. Check")
@@ -321,8 +322,15 @@ lesson.check("number of minima, stripes", len(lows["stripes"]), 3, within=0)
 lowest = np.unravel_index(landscape[..., 0].argmin(), landscape.shape[:2])
 lesson.check("offset of the lowest photometric loss [cm]", 100 * float(np.hypot(*offsets[list(lowest)])), 0.0,
              within=0.8)
-lesson.check("basin of the photometric loss, share of the offsets", shares[0], above=0, below=0.15)
+lesson.check("basin of the photometric loss, share of the offsets", shares[0], above=0, below=0.25)
 lesson.check("basin of the Chamfer distance", shares[1], above=0.8)
 lesson.check("share of photometric gradients that point the right way at 5 mm", float(right_way[1, 0]), above=0.8)
 lesson.check("the same at 5 cm", float(right_way[7, 0]), below=0.7)
-print(f"{options.name}: all checks passed")
+lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. Neither. The basin is a spot around the truth, about as wide as a stripe; no motion lies far outside. From 5 cm
+#    away the gradient of the colours is little better than a random direction, while Chamfer's still points the right
+#    way.

@@ -10,11 +10,12 @@ Equations:
 - Sec. IV-C, the error on held-out pokes: `lab.evaluation.true_motion`, `lab.evaluation.matched_iou`;
   tests/test_evaluation.py
 
-Time: 20 s. Pictures: 08_emergence.gif, 08_kink.png, 08_masks.png, 08_losses.png.
+Time: 20 s. Pictures: 10_emergence.gif, 10_kink.png, 10_masks.png, 10_losses.png,
+10_valley.png.
 
 Last lines to expect:
-   held-out: IoU of the masks: expected above 0.4, got 0.6557
-08_training: all checks passed
+   held-out: IoU of the masks: expected above 0.3, got 0.6384
+10_training: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. We train the whole model from scratch on the 400 pokes
@@ -36,7 +37,7 @@ from hind4sight_min.lab.evaluation import matched_iou, true_motion
 from hind4sight_min.lab.figures import PALETTE, TERMS, blend, flow_to_rgb
 from hind4sight_min.scene import crop, look
 
-options = lesson.begin("08_training")
+options = lesson.begin("10_training")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 train, _ = lesson.pokes("train")  # _ is the truth: training never sees it
@@ -48,35 +49,84 @@ if options.quick:
 shipped = checkpoints.load_run(lesson.data_small() / "checkpoint.npz")
 
 # %% [markdown]
-# ## What a step does
+# ## The optimiser, from plain descent up
 #
 # A *step* takes a batch of pokes, computes the gradient g of the full loss, Eq. (6), averaged over the batch, and
-# hands it to the optimiser, which says what to take away from the parameters. An *epoch* is as many steps as it takes
-# to see every poke once. The rate rises over the first steps, then falls to zero (`training.learning_rate`). There are
-# two optimisers, side by side in training.py; `Recipe.optimiser` chooses.
+# hands it to the *optimiser*, which says what to take away from the parameters. An *epoch* is as many steps as it takes
+# to see every poke once. The *rate* rises over the first steps, then falls to zero (`training.learning_rate`).
 #
-# `training.adam` is the paper's (Sec. III-G). It keeps a running mean m of g and a running mean v of its square, both
-# corrected for having started at 0, and takes away
+# - *Gradient descent* takes away rate * g. In a narrow valley it is in trouble: the rate must be small for the steep
+#   sides, and then it creeps along the gentle floor.
+# - *Momentum* takes away rate * m, with m a running mean of g. Across the valley the signs of g alternate and cancel,
+#   along it they add up.
+# - *Adam*, the paper's (Sec. III-G; `training.adam`), also keeps a running mean v of g^2, and divides by its root:
 #
-#     rate * m / (sqrt(v) + 1e-8)
+#       m <- 0.9 m + 0.1 g        v <- 0.999 v + 0.001 g^2        take away rate * m' / (sqrt(v') + 1e-8)
 #
-# In the very first step m = g and v = g^2: every parameter moves by the rate, against the sign of its gradient, however
-# small the gradient is.
+#   where m' = m / (1 - 0.9^t) and v' = v / (1 - 0.999^t) make up for the start at 0, t counting the steps from 1.
 #
-# `training.muon`, which we train with, leaves the biases to Adam. The weights of a layer are a matrix, and its running
-# mean M = A S B^T usually has a few large singular values S and many small ones: a few directions have all the say. It
-# takes away
+# **Predict before you run:** the valley below is 2,500 times as steep across as along. In Adam's first step m' = g
+# and v' = g^2. How far does it move across, and how far along?
+
+# %%
+def valley(place):
+    """Height and gradient at a place (2,): along the valley, and across it."""
+    x, y = place
+    return 0.5 * (x ** 2 + 2500 * y ** 2), np.array([x, 2500 * y])
+
+
+def momentum(run, gradient, rate):
+    run.first_moment += 0.1 * (gradient - run.first_moment)
+    return rate * run.first_moment
+
+
+RULES = {"gradient descent": (lambda run, gradient, rate: rate * gradient, 0.0007), "momentum": (momentum, 0.005),
+         "Adam": (training.adam, 0.3)}  # each with about the largest rate that goes well
+ways = {}
+for name, (rule, rate) in RULES.items():
+    toy = training.Run(recipe, {}, np.array([-9.0, 1.0]), np.zeros(2), np.zeros(2))
+    ways[name] = [toy.vector]
+    for toy.step in range(1, 61):
+        toy.vector = toy.vector - rule(toy, valley(toy.vector)[1], rate)
+        ways[name].append(toy.vector)
+heights = {name: np.array([valley(place)[0] for place in way]) for name, way in ways.items()}
+print("1. In the valley, height after 60 steps: "
+      + ", ".join(f"{name} {values[-1]:.2g}" for name, values in heights.items()))
+print(f"   Adam's first step: {np.abs(ways['Adam'][1] - ways['Adam'][0])}, with a gradient of "
+      f"{np.abs(valley(ways['Adam'][0])[1])}")
+
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained", width_ratios=(1.4, 1))
+x, y = np.meshgrid(np.linspace(-10, 3, 100), np.linspace(-1.5, 1.5, 60))
+axes[0].contour(x, y, valley((x, y))[0], levels=np.array([2, 20, 100, 400, 1000, 2000]), colors="0.8", linewidths=1)
+for (name, way), colour, style in zip(ways.items(), PALETTE[[6, 0, 5]], (".:", ".--", ".-")):
+    axes[0].plot(*np.array(way).T, style, color=colour, markersize=4, linewidth=1, label=name)
+    axes[1].semilogy(heights[name], style[1:], color=colour, linewidth=2, label=name)
+axes[0].plot(0, 0, "k+", markersize=12, markeredgewidth=2)
+axes[0].set(xlabel="along the valley (+: its lowest point)", ylabel="across, another scale")
+axes[1].set(xlabel="step", ylabel="height")
+axes[0].legend(fontsize=9, loc="lower right")
+axes[1].legend(fontsize=9)
+figure.suptitle("Gradient descent creeps along the floor; Adam moves as fast along it as across", fontsize=11)
+lesson.keep(options, figure, "valley")
+
+# %% [markdown]
+# ## An aside: Muon
+#
+# Skip this at first reading. `Recipe.optimiser` chooses between the paper's Adam and `training.muon`, with which we
+# train because it needs a third of the steps. Muon leaves the biases to Adam. The weights of a layer are a matrix, and
+# the running mean of its gradient, M = A S B^T, usually has a few large singular values S and many small ones: a few
+# directions have all the say. Muon takes away
 #
 #     rate * sqrt(larger of its two sizes) * A B^T
 #
-# instead, so that every direction has the same say (the root makes an entry move by the rate, in the root mean square,
-# as in Adam's first step). `training.orthogonalised` comes near A B^T without an SVD. Here is what both make of the
-# gradient of one layer of the shipped network:
+# so that every direction has the same say, as with Adam every parameter has. (The root makes an entry move by the rate,
+# in the root mean square, as in Adam's first step; `training.orthogonalised` comes near A B^T without an SVD.) What
+# both make of the gradient of one layer of the shipped network:
 
 # %%
 steps = np.arange(recipe.steps)
 rates = np.array([training.learning_rate(recipe, step) for step in steps])
-print(f"1. {recipe.steps} steps of {recipe.batch} pokes, {recipe.steps * recipe.batch / len(train):.1f} epochs; the "
+print(f"2. {recipe.steps} steps of {recipe.batch} pokes, {recipe.steps * recipe.batch / len(train):.1f} epochs; the "
       f"rate rises to {rates.max():.1e}")
 
 
@@ -102,7 +152,7 @@ for name, matrices in (("the gradient", ops.unflatten(gradient, shipped.layout))
 # of the picture's part around the poke by a hundredth of a pixel along the poke, and see what the photometric loss,
 # Eq. (3), says to it. The object that was poked gains, as it did move that way. Everything else loses.
 #
-# Guess first: most of what is not the object is bare table. Which wins, for motions as small as that?
+# **Predict before you run:** most of what is not the object is bare table. Which wins, for motions as small as that?
 
 # %%
 SHIFTS = np.array([-0.05, -0.02, -0.01, -0.005, -0.002, 0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05])  # px
@@ -124,7 +174,7 @@ for noise in NOISES:
     change.append(loss - loss[SHIFTS == 0])
 change = np.array(change)  # (2, shifts)
 for noise, values in zip(NOISES, change):
-    print(f"2. Images with noise of SD {noise}: photometric loss is lowest for a shift of "
+    print(f"3. Images with noise of SD {noise}: photometric loss is lowest for a shift of "
           f"{SHIFTS[values.argmin()]:.3f} px")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
@@ -142,10 +192,8 @@ figure.suptitle("A kink at no motion holds everything in place; a little noise r
 lesson.keep(options, figure, "kink")
 
 # %% [markdown]
-# What stands still wins: walls and the other objects have edges, too. A simulator renders them twice the same to the
-# last bit, so the absolute value in Eq. (3) sits in its kink there, and to leave it costs the same per pixel in every
-# direction, however small the motion. The object gains at the same rate, on fewer pixels. So no motion is a minimum. A
-# network whose first motions are small and shared by all is pushed back into it, and its masks shrink to be safe.
+# Without noise there is a kink at no motion, a minimum: a network whose first motions are small and shared by all is
+# pushed back into it, and its masks shrink to be safe.
 #
 # No camera takes the same picture twice. With noise of less than one grey level of 255 on I_t the kink becomes a
 # bowl, flat at the bottom, and there the object's gain decides. That is what `Recipe.image_noise` is for. (On I_{t+1}
@@ -214,7 +262,7 @@ def look_on(run, terms):
               f"ratio {ratio:.2f}, cover of moving points {on:.2f}, of still ones {off:.3f}, IoU {iou:.2f}")
 
 
-print("3. Training")
+print("4. Training")
 began = time.perf_counter()
 training.train(train, run, on_step=look_on)
 print(f"   {time.perf_counter() - began:.0f} s")
@@ -236,7 +284,7 @@ level = {name: float(np.mean(values)) for name, values in level.items()}
 epoch_end = step[1:].astype(int)
 epochs = {name: [np.mean([terms[name] for terms in log[max(end - EPOCH, 0):end]]) for end in epoch_end]
           for name in level}
-print(f"4. Ratio after {run.step} steps on {len(train)} pokes {ratio[-1]:.2f}, of the shipped checkpoint after "
+print(f"5. Ratio after {run.step} steps on {len(train)} pokes {ratio[-1]:.2f}, of the shipped checkpoint after "
       f"{shipped.step} steps {measure(shipped)[0]:.2f}")
 print(f"   cover of moving / of still points: fresh {on[0] / off[0]:.1f}, at the end {on[-1] / off[-1]:.0f}")
 for name, values in epochs.items():
@@ -324,7 +372,7 @@ heading = figure.suptitle("step 0", fontsize=11)
 figure.draw_without_rendering()
 figure.set_layout_engine("none")  # the layout of the first frame is that of all
 options.out.mkdir(parents=True, exist_ok=True)
-animation = options.out / "08_emergence.gif"
+animation = options.out / "10_emergence.gif"
 writer = PillowWriter(fps=4)
 with writer.saving(figure, animation, dpi=70):
     for at, masks, flow in snapshots + snapshots[-1:] * (0 if options.quick else 4):  # the last one stays for a while
@@ -336,24 +384,23 @@ with writer.saving(figure, animation, dpi=70):
         heading.set_text(f"step {at}")
         writer.grab_frame()
 plt.close(figure)
-print(f"   animation: {animation.name}, {animation.stat().st_size / 1000:.0f} kB")
+lesson.say_where(animation)
 
 # %% [markdown]
-# What happened? At first the cover falls everywhere. A mask on what stays drags it along, which costs Chamfer
-# distance, and a smaller mask is the nearest way out. It falls least where something really moves, for there motion
-# pays. Once the motion points the right way, the masks come back, on these points only.
-#
 # In the second row the mask keeps to the part of the object near the target. 400 pokes and some hundred steps are
 # little; the shipped checkpoint had many more of both, and its ratio on the same pokes is printed above.
 #
-# **Now change this:** give `Recipe` the option `image_noise=0.0`. What becomes of the cover and the ratio? (The Check
-# cell will object.) Then put the noise back and switch the 2D terms off:
-# `weights={**training.WEIGHTS, "photometric": 0.0, "flow_smoothness": 0.0}`. How much had they brought in so few
-# steps? (docs/research-log.md says what they bring in many: turns, and masks that do not spill onto the table.) And how
-# far does the paper's `optimiser="adam"` get?
+# **Now change this:** `training.Recipe(steps=200)` to `training.Recipe(steps=200, image_noise=0.0)`, and do not use
+# --quick. No motion is then a minimum of the photometric loss, and the Check "with noise: loss of the best shift
+# forwards" objects. The other losses pull the network out of it all the same, and its ratio comes out a little worse.
+# With `optimiser="adam"` instead, no Check objects; the ratio, too, comes out a little worse, and the masks clearly so.
 
 # %% Check
-print("5. Check")
+print("6. Check")
+lesson.check("Adam in the valley, height after 60 steps / that of gradient descent",
+             float(heights["Adam"][-1] / heights["gradient descent"][-1]), below=0.1)
+for part, step_of_adam in zip(("along", "across"), np.abs(ways["Adam"][1] - ways["Adam"][0])):
+    lesson.check(f"Adam's first step {part} the valley: the rate", float(step_of_adam), RULES["Adam"][1], within=1e-4)
 made_up = {name: np.array([number, number + 2.0]) for number, name in enumerate(training.WEIGHTS, 1)}  # two pokes each
 expected = sum(weight * (number + 1) for number, weight in enumerate(training.WEIGHTS.values(), 1))
 lesson.check("Eq. (6) by hand, ratio", float(losses.full_loss(made_up, training.WEIGHTS)) / expected, 1.0, within=1e-9)
@@ -394,7 +441,19 @@ lesson.check("held-out: ratio before training", float(ratio[0]), 1, within=1e-3)
 lesson.check("held-out: ratio at the end", float(ratio[-1]), below=0.85 if options.quick else 0.45)
 lesson.check("animation [kB]", animation.stat().st_size / 1000, above=10, below=400)
 lesson.check("cover of moving / of still points, fresh", float(on[0] / off[0]), 1, within=0.25)
-lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=2 if options.quick else 6)
+lesson.check("cover of moving / of still points at the end", float(on[-1] / off[-1]), above=1.5 if options.quick else 4)
 if not options.quick:
-    lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.4)
-print(f"{options.name}: all checks passed")
+    lesson.check("held-out: IoU of the masks", float(iou[-1]), above=0.3)
+lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. By the rate, both: |g| / sqrt(g^2) = 1, however steep or gentle the slope is.
+# 2. What stands still wins: walls and the other objects have edges, too. A simulator renders them twice the same to the
+#    last bit, so the absolute value in Eq. (3) sits in its kink there, and to leave it costs the same per pixel in
+#    every direction, however small the motion. The object gains at the same rate, on fewer pixels. So no motion is a
+#    minimum.
+# 3. It falls first, everywhere. A mask on what stays drags it along, which costs Chamfer distance, and a smaller mask
+#    is the nearest way out. It falls least where something really moves, for there motion pays. Once the motion points
+#    the right way, the masks come back, on these points only.

@@ -10,11 +10,11 @@ Equations:
 - Eq. (2) and (3) for comparison: `losses.chamfer_loss`, `losses.photometric_loss`; tests/test_eq2_chamfer.py,
   tests/test_eq3_photometric.py
 
-Time: 5 s. Pictures: 05_flows.png, 05_follow.png, 05_edges.png, 05_maps.png, 05_holes.png.
+Time: 5 s. Pictures: 06_flows.png, 06_follow.png, 06_edges.png, 06_maps.png, 06_holes.png.
 
 Last lines to expect:
    share of pokes in which the factor of L_ds is larger: expected above 0.7, got 0.85
-05_smoothness: all checks passed
+06_smoothness: all checks passed
 """
 # %% [markdown]
 # Step through with the cells below, or run the whole file. `losses.flow_smoothness_loss` is Eq. (4) as the package has
@@ -32,13 +32,13 @@ from hind4sight_min import geometry, losses, training
 from hind4sight_min.lab.evaluation import true_motion
 from hind4sight_min.lab.figures import PALETTE, flow_to_rgb
 
-options = lesson.begin("05_smoothness")
+options = lesson.begin("06_smoothness")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
 
 # %% [markdown]
 # ## A step by hand
 #
-# Write U and V for the optical flow in pixels (lesson 04) and I_t for the picture before the poke. Eq. (4) adds up the
+# Write U and V for the optical flow in pixels (lesson 05) and I_t for the picture before the poke. Eq. (4) adds up the
 # steps of the flow between neighbouring pixels, across and down, each with a weight that is small where the picture has
 # an edge:
 #
@@ -151,9 +151,9 @@ figure.suptitle("Steps are nearly free at the object's rim and stripes (dark) an
 lesson.keep(options, figure, "flows")
 
 # %% [markdown]
-# No motion is the cheapest: nothing is smoother than nothing. So Eq. (4) must never be strong enough to win against the
-# other losses. It is there to decide between flows that the others find alike, such as the true one and the spilled
-# one: plain table looks the same when it is shifted by a pixel or two.
+# Eq. (4) must never be strong enough to win against the other losses. It is there to decide between flows that the
+# others find alike, such as the true one and the spilled one: plain table looks the same when it is shifted by a pixel
+# or two.
 #
 # ## How sharp should the weight be?
 #
@@ -259,7 +259,7 @@ lesson.keep(options, figure, "follow")
 # An object that moves by less than its own size overlaps with where it was. In the overlap, points of the first cloud
 # find close neighbours in the second, though these are other bits of the object. The Chamfer distance, Eq. (2), takes
 # that for "did not move". So a mask with a hole, whose core stays behind, costs it little. Eq. (5) treats the two
-# distance maps of lesson 03 as Eq. (4) treats the flow:
+# distance maps of lesson 04 as Eq. (4) treats the flow:
 #
 #     L_ds = sum_xy |grad D_{P->P'}| e^(-|grad I_{t+1}|) + |grad D_{P'->P}| e^(-|grad I_t|)
 #
@@ -329,8 +329,9 @@ lesson.keep(options, figure, "holes")
 # package the smoothness terms speak softly: L_CD and L_rec pay most for a hole. The smoothness terms decide where those
 # two find two flows alike.
 #
-# **Now change this:** let the group be pokes of 5 to 9 cm instead of 1 to 3 (`0.05 < candidate.motion < 0.09`). The
-# objects then hardly overlap with where they were. What happens to the factor of L_CD, and why? (A check will fail.)
+# **Now change this:** `0.01 < candidate.motion < 0.03` to `0.05 < candidate.motion < 0.09`. These objects hardly
+# overlap with where they were, so a core that is left behind finds no close neighbours, and a hole raises L_CD by much
+# more. The Check "median factor of L_CD with a hole" objects.
 
 # %% Check
 print("7. Check")
@@ -363,4 +364,10 @@ lesson.check("and on the spilled rim", float(left_over["edge-aware", "rim"][-1])
 lesson.check("on the object without the weights", float(left_over["without edges", "object"][-1]), below=0.5)
 lesson.check("median factor of L_CD with a hole", float(medians[0, 0]), above=1.1, below=1.8)
 lesson.check("share of pokes in which the factor of L_ds is larger", wins, above=0.7)
-print(f"{options.name}: all checks passed")
+lesson.end(options)
+
+# %% [markdown]
+# ## Answers
+#
+# 1. No motion, then the true flow, the spilled one, the noisy one. Nothing is smoother than nothing, which is why Eq.
+#    (4) alone would teach a model to move nothing.
