@@ -16,7 +16,7 @@ from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.lab import cli, control
 from hind4sight_min.lab.cli import data_small, main
 from hind4sight_min.lab.noise import under_noise
-from hind4sight_min.networks import Sizes
+from hind4sight_min.networks import Sizes, encode, predict, state_embedding
 from hind4sight_min.sim.truth import load_truth, save_truth
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -192,15 +192,6 @@ def test_save_sequence_draws_a_frame_per_picture_and_the_pokes_that_have_a_start
         assert film.n_frames >= 3
 
 
-@pytest.mark.parametrize("name, wrong", [("images", np.full((3, 12, 16, 3), 2.0)), ("marks", np.zeros((3, 2, 2))),
-                                         ("goals", np.zeros((1, 3))), ("arrows", np.zeros((3, 2, 2))),
-                                         ("distances", np.zeros(2))])
-def test_save_sequence_names_what_does_not_fit(tmp_path, name, wrong):
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        sequence(tmp_path / "plan.gif", **{name: wrong})
-    assert not list(tmp_path.iterdir())
-
-
 def test_control_figure_draws_the_mean_of_every_planner():
     curves = {(planner, objects): np.random.default_rng(objects).random((6, 4)) * 0.1 * len(planner)
               for planner in ("learned", "oracle") for objects in (1, 2)}

@@ -78,16 +78,6 @@ def test_without_pybullet_the_arena_says_so_in_one_sentence(monkeypatch):
     assert "\n" not in str(caught.value) and caught.value.__suppress_context__
 
 
-def test_look_at_sees_the_target_in_the_middle_upright_and_not_straight_below():
-    pose = look_at((0.3, 0.2, 0.7), (-0.1, 0.05, 0.02))
-    np.testing.assert_allclose(pose[:3, 3], [0.3, 0.2, 0.7])
-    assert pose[2, 0] == pytest.approx(0, abs=1e-12) and pose[2, 1] < -0.1, "the horizon is tilted or upside down"
-    camera = Camera(8, 6, 10.0, 11.0, 3.4, 2.6, pose)  # which refuses what is not a rotation
-    np.testing.assert_allclose(project(np.array([-0.1, 0.05, 0.02]), camera), [3.4, 2.6], atol=1e-9)
-    with pytest.raises(ValueError, match="eye, target"):
-        look_at((0.1, 0.2, 1), (0.1, 0.2, 0))
-
-
 @pytest.mark.parametrize("width, height", [(16, 12), (64, 48), (640, 480)])
 def test_the_camera_sees_the_whole_arena_from_the_front_and_mirrors_x(width, height):
     camera = arena_camera(width, height)

@@ -40,7 +40,7 @@ def test_every_model_is_trained_with_its_own_terms_for_the_same_budget(model):
     assert (recipe.steps, recipe.seed) == (tables.FULL.steps, 3)
     assert tables.recipe_of(Cell(model, "noisy", 3, long=True), tables.FULL).steps == tables.FULL.long_steps
     geometry, picture = {"chamfer", "distance_smoothness"}, {"photometric", "flow_smoothness"}
-    terms = {"2d": picture, "3d": geometry, "2d_3d": geometry | picture, "full": geometry | picture | {"inverse"}}
+    terms = {"2d": picture, "3d": geometry, "2d_3d": geometry | picture, "full": geometry | picture | {"inverse", "binary_masks"}}
     assert {name for name, weight in recipe.weights.items() if weight} == terms.get(model, {"association"})
     clean, noisy = (tables.objective_of(Cell(model, noise, 3)) for noise in ("clean", "noisy"))
     if model in terms:
