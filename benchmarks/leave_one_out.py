@@ -42,7 +42,7 @@ VARIANTS = {
     "looks at all points of the box": ([("scene.py", "scene.valid & scene.stands_out & away", "scene.valid & away")],
                                        {}, 0.0),
     "mask logits unbounded": ([("networks.py", "MASK_BOUND = 6.0", "MASK_BOUND = 1e3")], {}, 0.0),
-    "no price on half masks": ([("training.py", '"binary_masks": 0.3', '"binary_masks": 0.0')], {}, 0.0),
+    "no price on half masks": ([("training.py", '"binary_masks": 0.5', '"binary_masks": 0.0')], {}, 0.0),
     "motions in units of 5 cm and 1 rad": (
         [("networks.py", "np.array([0.005] * 3 + [0.1] * 3", "np.array([0.05] * 3 + [1.0] * 3")], {}, 0.0),
     "gradient of L_sim to the encoder too": (

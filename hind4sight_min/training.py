@@ -1,6 +1,6 @@
 """Unsupervised training: the recipe, a batch, the loss of Eq. (6), two optimisers, one loop."""
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from autograd import grad
@@ -16,7 +16,7 @@ from .scene import Scene, crop, look, most_changed, scene_of
 # From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
 # See docs/research-log.md.
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
-           "binary_masks": 0.3}
+           "binary_masks": 0.5}
 
 
 @dataclass(frozen=True)
@@ -239,13 +239,22 @@ def chunk_gradient(objective, vector, layout, recipe, interactions, seed):
     return kept, np.float32(share) * grad(loss)(vector)
 
 
+def recipe_at(recipe, step):
+    """The recipe with the weights of a step: that of `binary_masks` grows from 0 in proportion to the steps, for masks
+    that must be decided before anything has moved decide for the background.
+    """
+    share = (step + 1) / recipe.steps
+    return replace(recipe, weights={name: weight * share if name == "binary_masks" else weight
+                                    for name, weight in recipe.weights.items()})
+
+
 def training_step(data, run, objective=unsupervised, map=map):
     """One step: draw a batch, differentiate its loss chunk by chunk, take the optimiser's step. Updates the run.
 
     -> the terms, dict of floats, means over the batch. Raises FloatingPointError if the gradient is not finite; the run
     is then as it was.
     """
-    recipe, rows = run.recipe, rows_of_step(run.recipe, len(data), run.step)
+    recipe, rows = recipe_at(run.recipe, run.step), rows_of_step(run.recipe, len(data), run.step)
     chunks = [(objective, run.vector, run.layout, recipe, data[rows[i:i + CHUNK]], [recipe.seed, 2, run.step, i])
               for i in range(0, recipe.batch, CHUNK)]
     terms, gradients = zip(*map(chunk_gradient, *zip(*chunks)))

@@ -123,6 +123,19 @@ def test_every_term_reaches_masks_motions_and_encoder_in_float32(name):
         assert np.abs(parts[reached]).max() > 0 and parts[reached].dtype == np.float32, reached
 
 
+def test_the_price_on_half_masks_grows_in_proportion_to_the_steps_and_nothing_else_does():
+    seen, run = [], random_run()
+
+    def objective(params, recipe, interactions, rng):
+        seen.append(recipe.weights)
+        return training.unsupervised(params, recipe, interactions, rng)
+    for step in (0, 3, 5):
+        run.step = step
+        training.training_step(tiny_pokes(), run, objective)
+        weights = {**WEIGHTS, "binary_masks": pytest.approx(WEIGHTS["binary_masks"] * (step + 1) / TINY.steps)}
+        assert seen[-1] == weights, f"step {step}"
+
+
 # --- optimisers ---------------------------------------------------------------------------------------------------
 
 def two_steps(optimiser, gradients):
