@@ -1,0 +1,35 @@
+"""One file per assignment: its docstring is the theory, TASKS are what there is to do.
+
+To add a task, copy one of them in its file and change it; to add an assignment, add its file to ASSIGNMENTS.
+"""
+from dataclasses import dataclass
+
+from . import a2_chamfer
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """number; name: of the exercise's file; title; theory: text; tasks; tests: files of tests/ that go with it."""
+    number: int
+    name: str
+    title: str
+    theory: str
+    tasks: tuple
+    tests: tuple
+
+
+def _assignment(number, module):
+    title, theory = module.__doc__.split("\n", 1)
+    return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(), module.TASKS, module.TESTS)
+
+
+ASSIGNMENTS = (_assignment(2, a2_chamfer),)
+
+
+def assignment_of(name):
+    """The assignment of a number or a name, "2" or "chamfer". Raises ValueError where there is none."""
+    for assignment in ASSIGNMENTS:
+        if str(name) in (str(assignment.number), assignment.name):
+            return assignment
+    known = ", ".join(f"{each.number} {each.name}" for each in ASSIGNMENTS)
+    raise ValueError(f"assignment: expected one of {known}, got {name}")
