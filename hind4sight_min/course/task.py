@@ -19,6 +19,12 @@ def by_name(function, **case):
     return function(**case)
 
 
+def single(case):
+    """The same case in float32."""
+    return {name: value.astype(np.float32) if getattr(value, "dtype", None) == float else value
+            for name, value in case.items()}
+
+
 @dataclass(frozen=True)
 class Task:
     """One function to write.

@@ -4,18 +4,21 @@ To add a task, copy one of them in its file and change it; to add an assignment,
 """
 from dataclasses import dataclass
 
-from . import a2_chamfer
+from . import a1_camera, a2_chamfer
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """number; name: of the exercise's file; title; theory: text; tasks; tests: files of tests/ that go with it."""
+    """number; name: of the exercise's file; title; theory: text; tasks; tests: files of tests/ that go with it; files:
+    Assignment -> name -> text of the exercise's files, where it is not carved.
+    """
     number: int
     name: str
     title: str
     theory: str
     tasks: tuple
-    tests: tuple
+    tests: tuple = ()
+    files: callable = None
 
 
 def _assignment(number, module):
@@ -23,7 +26,7 @@ def _assignment(number, module):
     return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(), module.TASKS, module.TESTS)
 
 
-ASSIGNMENTS = (_assignment(2, a2_chamfer),)
+ASSIGNMENTS = _assignment(1, a1_camera), _assignment(2, a2_chamfer)
 
 
 def assignment_of(name):
