@@ -131,18 +131,18 @@ def outcome(content, ending, code, prints, limits):
     answer, failure = None, ""
     if ending == "size":
         failure = f"The answer is longer than {limits.answer >> 20} MB."
-    elif ending == "time" or code == 128 + signal.SIGKILL:
-        failure = f"No answer within {limits.cpu} s of computing, {limits.wall:.0f} s in all: does every loop end?"
-    elif whole and len(parts) == 2:
-        failure = f"The process ended (exit status {code}) before it answered: does the code call exit()?"
-    else:
+    elif whole and len(parts) > 2:
         try:
-            answer = channel.decode(parts[2:]) if whole else None
+            answer = channel.decode(parts[2:])
             if not isinstance(answer, dict) or [*answer] not in (["answer"], ["failed"]):
                 raise ValueError("it has another form")
             failure = one_line(answer.get("failed", ""))
         except ValueError as error:
             failure = f"What came back is no answer: {one_line(error)}."
+    elif ending == "time" or code == 128 + signal.SIGKILL:
+        failure = f"No answer within {limits.cpu} s of computing, {limits.wall:.0f} s in all: does every loop end?"
+    else:
+        failure = f"The process ended (exit status {code}) before it answered: does the code call exit()?"
     return Outcome(None if failure else answer["answer"], failure, ", ".join([*in_force, "limits", "time-out"]), prints)
 
 

@@ -252,6 +252,11 @@ def click(image):
     return points[::2], points[1::2]
 
 
+def run_grade(args):
+    from ..course import grade_commands  # here: a course is not for everyone
+    grade_commands.run_grade(args)
+
+
 # --- the demo ----------------------------------------------------------------------------------------------
 
 DEMO_POKES, DEMO_TEST_POKES, DEMO_STEPS = 2000, 200, 1000
@@ -387,6 +392,19 @@ def build_parser():
     add = command("demo", run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, "
                   "train, evaluate and show on the shipped pokes", "--seed", "--jobs", "--json")
     add("--out", default="runs/demo")
+
+    add = command("grade", run_grade, "grade a submission of an assignment, each task in a process of its own; or a "
+                  "class of them")
+    add("folder", nargs="?", help="submission: a folder, a zip file or the file itself")
+    add("--all", metavar="FOLDER", help="a folder of submissions; with --csv and --assignment")
+    add("--csv", metavar="FILE", help="the class's grades; details in FILE_results/, from which it goes on")
+    add("--assignment", metavar="N", help="its number or name (what the submission's file is called)")
+    add("--task", metavar="N.M", help="this task alone")
+    add("--public", action="store_true", help="on the inputs that students have, with what their code prints")
+    add("--seed", metavar="FILE", help="of the held-back inputs: a number, or a file that students never see (drawn)")
+    add("--pokes", metavar="FOLDER", help="assignment 8: the held-back pokes, with their truth (the shipped test set)")
+    add("--out", default="results.json", help="in Gradescope's format, whole after every task (results.json)")
+    add("--jobs", type=int, default=2, help="submissions at a time (2)")
     return parser
 
 
