@@ -1,0 +1,245 @@
+"""Grading holds: right submissions get their points, whatever a submission does to the grader gets it none."""
+import csv
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hind4sight_min.course import assignment_of, blank, carve, channel, grading, sandbox
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import grade_class  # noqa: E402
+
+CHAMFER = assignment_of("chamfer")
+SHORT = sandbox.Limits(cpu=2, wall=20.0, memory=3 << 29)
+HOW = grading.How(seed=7, limits=SHORT)
+
+
+def items(*functions, how=HOW):
+    return [item for item in grading.items_of(CHAMFER, how) if item.name.split()[1] in functions]
+
+
+def scores(content, *functions, how=HOW):
+    """The shares of the points, and the sentences."""
+    results = grading.grade(items(*functions, how=how), content)
+    return ([test["score"] / test["max_score"] for test in results["tests"]],
+            [test["output"] for test in results["tests"]])
+
+
+def left_behind():
+    """Processes of the user ids that students' code runs under."""
+    return [user for user in sandbox.tasks_by_user() if 60100 <= user < 64900]
+
+
+# --- right and wrong --------------------------------------------------------------------------------------------------
+
+def test_the_reference_gets_all_points_and_the_skeleton_none(tmp_path):
+    functions = "chamfer_loss", "nearest_squared_distances"
+    shares, sentences = scores(grade_class.solution(CHAMFER).encode(), *functions)
+    assert shares == [1, 1], sentences
+    assert scores(carve.exercise_text(CHAMFER).encode(), *functions)[0] == [0, 0]
+
+
+def test_half_for_the_value_half_for_the_gradient():
+    one_sided = "from autograd.tracer import getval\ndef chamfer_loss(map_predicted, map_observed):\n" \
+                "    return (map_predicted + getval(map_observed)).sum(axis=1)\n"
+    assert scores(one_sided.encode(), "chamfer_loss")[0] == [0.5]
+
+
+def test_the_function_asked_for_is_not_in_the_package_the_student_sees():
+    copied = "from hind4sight_min.losses import chamfer_loss, seen_in_both\n"
+    assert scores(copied.encode(), "chamfer_loss", "seen_in_both")[0] == [0, 0]
+
+
+def test_held_back_inputs_do_not_come_out_by_an_exception():
+    source = b"def chamfer_loss(map_predicted, map_observed):\n" \
+             b"    if map_predicted.shape[1] > 4: raise ValueError(repr(map_predicted))\n" \
+             b"    return (map_predicted + map_observed).sum(axis=1)\n"
+    _, (sentence,) = scores(source, "chamfer_loss")
+    assert "ValueError" in sentence and "array" not in sentence
+    _, (sentence,) = scores(source, "chamfer_loss", how=replace(HOW, seed=None))
+    assert "array" in sentence, "with public inputs it helps"
+
+
+# --- hostile ----------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("name", grade_class.HOSTILE)
+def test_an_attack_gets_no_points_and_costs_none(name, tmp_path):
+    (tmp_path / "seed").write_text("secret")
+    (tmp_path / "seed").chmod(0o600)
+    began = time.monotonic()
+    shares, sentences = scores(grade_class.hostile(name, tmp_path).encode(), "chamfer_loss", "seen_in_both")
+    assert shares == [0, 1], sentences
+    assert all(sentences) and time.monotonic() - began < 60
+    assert not left_behind()
+    assert {*os.listdir(tmp_path)} == {"seed"}
+
+
+BROKEN = {"null bytes": b"x = 1\0\n", "latin-1": "# caf\xe9\n".encode("latin-1"), "no function": b"x = 1\n",
+          "not Python": b"def chamfer_loss(:\n", "empty": b"", "raises": b"raise KeyError('x')\n",
+          "exits": b"import os\nos._exit(3)\n", "another type": b"chamfer_loss = 3\n",
+          "no numbers": b"def chamfer_loss(map_predicted, map_observed):\n    return 'all right'\n"}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_gets_one_clear_sentence(name):
+    (share,), (sentence,) = scores(BROKEN[name], "chamfer_loss")
+    assert share == 0 and "\n" not in sentence and 10 < len(sentence) < 400, sentence
+
+
+def test_a_byte_order_mark_and_windows_line_ends_do_no_harm():
+    source = b"\xef\xbb\xbf" + grade_class.hostile("os._exit").replace("\n", "\r\n").encode()
+    assert scores(source, "seen_in_both")[0] == [1]
+
+
+def test_no_network(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = f"import socket\nsocket.create_connection(('127.0.0.1', {server.getsockname()[1]}), 5)\n" + \
+                 grade_class.FILE.format(seed_folder="", body="        pass")
+        (test,) = grading.grade(items("seen_in_both"), source.encode())["tests"]
+        results = sandbox.run(blank.package_for(), job := {"kind": "task", "files": {}, "file": "none.py", "number": "2.1",
+                                                           "cases": []}, SHORT)
+    if "network" not in results.isolation:
+        pytest.skip(f"this kernel does not give {os.getuid()} a network of its own: {results.isolation}, {job['kind']}")
+    assert test["score"] == 0 and "rror" in test["output"]
+
+
+# --- what comes through the pipe ----------------------------------------------------------------------------------------
+
+def test_a_message_comes_back_as_it_was():
+    value = {"a": [1, 2.5, None, "x", True], "b": {"c": np.arange(6.0).reshape(2, 3), "d": np.float32(2)},
+             "e": np.asfortranarray(np.ones((2, 3), bool)), "f": np.zeros((0, 3), np.float32)}
+    found = channel.decode(channel.frames(channel.encode(value))[0])
+    np.testing.assert_equal(found, value)
+    assert [found["b"]["d"].dtype, found["e"].dtype, found["f"].shape] == [np.float32, bool, (0, 3)]
+
+
+def npy(text):
+    """A .npy file of a header alone."""
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
+
+
+@pytest.mark.parametrize("content", [
+    npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"),
+    npy("{'descr': '|O', 'fortran_order': False, 'shape': (0,)}"),
+    npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"),
+    npy("{'descr': '<f8', 'fortran_order': False, 'shape': ()}") + b"1234", npy("__import__('os')._exit(1)"), b"", b"\0"])
+def test_arrays_that_are_not_what_they_say_are_refused(content):
+    with pytest.raises(ValueError):
+        channel.decode([b'{"npy": 0}', memoryview(content)])
+
+
+@pytest.mark.parametrize("text", [b"", b"[" * 100000, b'{"npy": 5}', b'{"npy": -1}', b"\xff", b'{"npy": null}'])
+def test_json_that_is_not_ours_is_refused(text):
+    with pytest.raises(ValueError):
+        channel.decode([text])
+
+
+# --- submissions --------------------------------------------------------------------------------------------------------
+
+def zipped(path, **members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path
+
+
+def test_the_last_attempt_by_name_is_found_wherever_it_lies(tmp_path):
+    folder = tmp_path / "Ann Lee" / "my work"
+    for attempt in ("attempt 2", "attempt 10"):
+        (folder / attempt).mkdir(parents=True)
+        (folder / attempt / "chamfer.py").write_text(attempt)
+    assert grading.find_submission(tmp_path / "Ann Lee", "chamfer.py")[::2] == (b"attempt 10", 2)
+    path = zipped(tmp_path / "bo.zip", **{"__MACOSX/a/z/chamfer.py": b"no", "a/b/chamfer.py": b"yes"})
+    assert grading.find_submission(path, "chamfer.py")[0] == b"yes"
+
+
+def refused_zips(folder):
+    link = zipfile.ZipInfo("chamfer.py")
+    link.external_attr = 0o120777 << 16
+    with zipfile.ZipFile(folder / "link.zip", "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+    zipped(folder / "dots.zip", **{"chamfer.py": b"", "../../evil.py": b""})
+    zipped(folder / "absolute.zip", **{"/tmp/chamfer.py": b""})
+    zipped(folder / "drive.zip", **{"c:\\chamfer.py": b""})
+    zipped(folder / "bomb.zip", **{"chamfer.py": b"", "big": bytes(101 << 20)})
+    zipped(folder / "long.zip", **{"chamfer.py": bytes(2 << 20)})
+    zipped(folder / "many.zip", **{f"{i}.py": b"" for i in range(2500)})
+    (folder / "damaged.zip").write_bytes(b"PK\3\4 no zip")
+    with open(folder / "chamfer.py", "wb") as file:
+        file.truncate(100 << 20)
+    with open(folder / "large.zip", "wb") as file:
+        file.truncate(200 << 20)
+    return sorted(folder.iterdir())
+
+
+def test_what_is_too_large_or_leads_outside_is_refused_in_one_line(tmp_path):
+    began = time.monotonic()
+    for path in refused_zips(tmp_path):
+        with pytest.raises(ValueError) as caught:
+            grading.find_submission(path, "chamfer.py")
+        assert "\n" not in str(caught.value) and path.name in str(caught.value), path
+    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 10
+
+
+# --- results ------------------------------------------------------------------------------------------------------------
+
+def test_results_are_on_disk_before_the_first_task_and_after_each(tmp_path):
+    seen, path = [], tmp_path / "results.json"
+
+    def mark(content):
+        seen.append(json.loads(path.read_text()))
+        return grading.Mark(1.0, "Right.", "limits")
+    grading.grade([grading.Item(f"2.{i} f", 5, mark) for i in range(2)], b"", path)
+    seen.append(json.loads(path.read_text()))
+    assert [each["score"] for each in seen] == [0, 5, 10]
+    assert seen[0]["tests"][1]["output"] == "Not graded yet." and [*seen[2]["tests"][0]] == [
+        "max_score", "name", "output", "score", "status"]
+
+
+def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_path, monkeypatch):
+    folder, out = tmp_path / "class", tmp_path / "grades.csv"
+    right = grade_class.hostile("os._exit").encode()
+    for name, content in (("Ann Lee", right), ("Bo", right), ("Cy", b"x = 1\0\n")):
+        (folder / name / "deep er").mkdir(parents=True)
+        (folder / name / "deep er" / "chamfer.py").write_bytes(content)
+    zipped(folder / "Di attempt 2.zip", **{"chamfer.py": b""})
+    zipped(folder / "Di attempt 10.zip", **{"x/chamfer.py": right})
+    zipped(folder / "Ed.zip", **{"../chamfer.py": right})
+    (folder / "Flo").mkdir()
+    few = items("seen_in_both")
+    monkeypatch.setattr(grading, "items_of", lambda *_: few)
+    rows = grading.grade_all(folder, CHAMFER, HOW, out)
+    found = {row["student"]: float(row["score"]) for row in csv.DictReader(io.StringIO(out.read_text()))}
+    assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0}
+    assert "'../chamfer.py'" in rows[4]["note"] and "no chamfer.py" in rows[5]["note"]
+    monkeypatch.setattr(sandbox, "run", None)  # what is finished is not run again
+    assert grading.grade_all(folder, CHAMFER, HOW, out) == rows
+
+
+def test_a_killed_grader_leaves_whole_results_and_no_process(tmp_path):
+    (tmp_path / "chamfer.py").write_text(grade_class.hostile("endless loop"))
+    process = subprocess.Popen([sys.executable, "-m", "hind4sight_min", "grade", tmp_path / "chamfer.py", "--task", "2.5",
+                                "--out", tmp_path / "results.json"], env={**os.environ, "PYTHONPATH": str(ROOT)})
+    while not left_behind() and process.poll() is None and os.getuid() == 0:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    for _ in range(60):
+        if not left_behind():
+            break
+        time.sleep(0.05)
+    assert not left_behind(), "the guard ends with the grader"
+    assert json.loads((tmp_path / "results.json").read_text())["tests"][0]["output"] == "Not graded yet."
