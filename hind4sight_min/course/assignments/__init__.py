@@ -4,7 +4,7 @@ To add a task, copy one of them in its file and change it; to add an assignment,
 """
 from dataclasses import dataclass
 
-from . import a1_camera, a2_chamfer
+from . import a1_camera, a2_chamfer, a3_warping, a4_smoothness
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ def _assignment(number, module):
     return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(), module.TASKS, module.TESTS)
 
 
-ASSIGNMENTS = _assignment(1, a1_camera), _assignment(2, a2_chamfer)
+ASSIGNMENTS = tuple(_assignment(number, module) for number, module in enumerate(
+    (a1_camera, a2_chamfer, a3_warping, a4_smoothness), 1))
 
 
 def assignment_of(name):
