@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce; `hind4sight COMMAND --help`."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `hind4sight COMMAND --help`."""
 import argparse
 import json
 import os
@@ -293,6 +293,13 @@ def run_demo(args):
     write_json(args.json or found, {f"demo_{name}": value for name, value in metrics.items()})
 
 
+# --- the course --------------------------------------------------------------------------------------------
+
+def run_course(args):
+    from ..course.commands import run_course
+    run_course(args)
+
+
 # --- the command line -----------------------------------------------------------------------------------------
 
 def term_weight(text):
@@ -387,6 +394,11 @@ def build_parser():
     add = command("demo", run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, "
                   "train, evaluate and show on the shipped pokes", "--seed", "--jobs", "--json")
     add("--out", default="runs/demo")
+
+    add = command("course", run_course, "exercises for a class: list them, or start one in a folder of its own")
+    add("action", choices=("list", "start"))
+    add("name", nargs="?", help="number or name of the exercise to start")
+    add("--out", help="a new folder (the exercise's name)")
     return parser
 
 
