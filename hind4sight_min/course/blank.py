@@ -7,6 +7,8 @@ import tempfile
 import threading
 from pathlib import Path
 
+from . import bugs
+
 PACKAGE = Path(__file__).resolve().parents[1]
 ASKED = "raise NotImplementedError('this is what the task asks for')"
 
@@ -45,10 +47,19 @@ def without_answers(source):
         tree.body = kept
 
 
-def write_package(folder, name=None):
-    """Copy the package into a folder, compiled, without its answers; `name`: of the function to blank, module.function.
+def without_mutants(source):
+    """Source text of bugs.py without its mutants. Not in the paper: they are the answers of assignment 7."""
+    tree = ast.parse(source)
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and node.targets[0].id == "MUTANTS":
+            node.value = ast.Tuple([], ast.Load())
+    return ast.unparse(tree)
 
-    Not in the paper: grading. Every user may read the copy.
+
+def write_package(folder, name=None):
+    """Copy the package into a folder, without its answers; `name`: of the function to blank, module.function.
+
+    Not in the paper: grading.
     """
     blank, _, function = (name or "").rpartition(".")
     for path in PACKAGE.rglob("*.py"):
@@ -58,24 +69,47 @@ def write_package(folder, name=None):
             source = blanked(source, function)
         elif inside.parent.name == "assignments" and inside.name != "__init__.py":
             source = without_answers(source)
-        target = Path(folder, PACKAGE.name, inside)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(source, encoding="utf-8")
-    compileall.compile_dir(folder, quiet=2)
-    for path in [Path(folder), *Path(folder).rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
+        elif inside.as_posix() == "course/bugs.py":
+            source = without_mutants(source)
+        write_source(folder, inside, source)
+
+
+NEEDED_TO_MEASURE = "__init__.py", "course/task.py", "course/channel.py", "course/bugs.py"
+
+
+def write_mutant(folder, number):
+    """A mutant of assignment 7, 0 for the right package, into a folder, and of this package what measuring it takes.
+
+    Not in the paper: grading. The rest is left out: a measurement that compares with the reference would be none.
+    """
+    for name in NEEDED_TO_MEASURE:
+        source = (PACKAGE / name).read_text(encoding="utf-8")
+        write_source(folder, name, without_mutants(source) if name == "course/bugs.py" else source)
+    write_source(folder, "course/__init__.py", "")
+    bugs.write_package(number, folder)
+
+
+def write_source(folder, inside, source):
+    """A file of the copied package."""
+    target = Path(folder, PACKAGE.name, inside)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(source, encoding="utf-8")
 
 
 KEPT, LOCK = {}, threading.Lock()
 
 
-def package_for(name=None):
-    """The folder of `write_package`'s copy for a function; made once, and gone when this process ends -> str.
+def package_for(what=None):
+    """A folder with the package: without a function (its name), with a mutant (its number), or as it is (None) -> str.
 
-    Not in the paper: grading.
+    Not in the paper: grading. Made once, compiled, for every user to read, and gone when this process ends.
     """
     with LOCK:
-        if name not in KEPT:
-            KEPT[name] = tempfile.TemporaryDirectory(prefix="hind4sight-package-")
-            write_package(KEPT[name].name, name)
-        return KEPT[name].name
+        if what not in KEPT:
+            KEPT[what] = tempfile.TemporaryDirectory(prefix="hind4sight-package-")
+            folder = Path(KEPT[what].name)
+            (write_mutant if isinstance(what, int) else write_package)(folder, what)
+            compileall.compile_dir(folder, quiet=2)
+            for path in [folder, *folder.rglob("*")]:
+                path.chmod(0o755 if path.is_dir() else 0o644)
+        return KEPT[what].name

@@ -8,12 +8,11 @@ import sys
 import sysconfig
 import textwrap
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from .assignments import assignment_of
-from .task import answer, answers_of, judge
+from .task import answer, answers_of, judge, namespace_of
 
 SHARED_TESTS = ("helpers.py", "tiny.py")  # what the files of tests/ import
 MARKERS = "eq1", "eq2", "eq3", "eq4", "eq5", "eq6", "inverse"
@@ -225,7 +224,7 @@ def load_student(path, task):
 
     A primitive and its VJP are told apart too: the file registers its own VJP with its own primitive.
     """
-    namespace = _namespace(path)
+    namespace = namespace_of(path)
     for other in assignment_of(task.number.partition(".")[0]).tasks:
         if other.number != task.number:
             namespace[other.function] = other.reference
@@ -236,7 +235,7 @@ def put_in_place(path, test_module, monkeypatch):
     """Replace the reference's functions by the student's in every module of the package that holds them, and in the
     module of a test, until `monkeypatch` takes it back.
     """
-    namespace, assignment = _namespace(path), assignment_of(Path(path).stem)
+    namespace, assignment = namespace_of(path), assignment_of(Path(path).stem)
     modules = [module for name, module in list(sys.modules.items())
                if name.startswith("hind4sight_min") and not name.startswith("hind4sight_min.course")]
     for task in assignment.tasks:
@@ -245,15 +244,6 @@ def put_in_place(path, test_module, monkeypatch):
             for name, value in list(vars(module).items()):
                 if value is reference:
                     monkeypatch.setattr(module, name, written)
-
-
-def _namespace(path):
-    """Run a file under a private name, never from a cache -> its namespace."""
-    module = ModuleType(f"student_{Path(path).stem}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses look for it there
-    exec(compile(Path(path).read_bytes(), str(path), "exec"), vars(module))
-    return vars(module)
 
 
 def _function(namespace, task, path):

@@ -1,4 +1,4 @@
-"""`hind4sight grade DIR`, `hind4sight grade --all DIR --csv F`, `hind4sight course bundle N --out FOLDER_or.zip`."""
+"""`hind4sight grade DIR` and `hind4sight grade --all DIR --csv FILE --assignment N`."""
 import hashlib
 import os
 import secrets
@@ -72,10 +72,3 @@ def kept_seed(path):
         path.touch(mode=0o600)
         path.write_text(secrets.token_hex(16))
     return path
-
-
-def run_bundle(args):
-    """Write the autograder of one assignment for Gradescope."""
-    from . import bundle
-    out = bundle.write_bundle(assignment_of(args.name), args.out, args.seed, args.pokes)
-    print(f"{out}: upload it as the autograder; it holds the seed of the held-back inputs")

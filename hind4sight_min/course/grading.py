@@ -7,6 +7,7 @@ import csv
 import hashlib
 import io
 import json
+import random
 import re
 import stat
 import threading
@@ -14,12 +15,13 @@ import zipfile
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ..disk.files import write_json, write_text
-from . import blank, sandbox
+from . import blank, bugs, sandbox
 from .task import Answer, judge
 
 MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the file, bytes of a zip unpacked, its members
@@ -171,18 +173,36 @@ def shown(outcome):
     return f"\nPrinted:\n{outcome.prints[-1000:]}" if outcome.prints.strip() else ""
 
 
+def mark_bug(assignment, number, how, content):
+    """Grade one measurement of assignment 7 -> Mark, on the right package and on the mutant, in random order.
+
+    Not in the paper: grading.
+    """
+    found, file = {}, f"{assignment.name}.py"
+    for which in random.sample((0, number), 2):
+        outcome = sandbox.run(blank.package_for(which), {
+            "kind": "bug", "files": {file: content}, "file": file, "number": number}, how.limits, how.namespaces)
+        found[which] = outcome.failure or measured(outcome.answer)
+    verdict = bugs.judge(number, found[0], found[number])
+    return Mark(verdict.share, sandbox.one_line(verdict.sentence) or "Right.", outcome.isolation)
+
+
+def measured(answer):
+    """Three numbers, or a str that says what went wrong: all that `bugs.judge` is to be given."""
+    if isinstance(answer, list) and len(answer) == 3 and all(isinstance(each, (int, float)) for each in answer):
+        return tuple(float(each) for each in answer)
+    return answer if isinstance(answer, str) else "what came back is no answer"
+
+
 def items_of(assignment, how):
     """What an assignment's points are given for -> list of Items. Not in the paper: grading."""
-    if assignment.name == "bugs":
-        from . import mutants
-        return mutants.items(assignment, how)
     if assignment.name == "improve":
-        from . import improve
-        return improve.items(assignment, how)
-
-    def item(task):
-        return Item(f"{task.number} {task.function}", task.points, lambda content: mark_task(assignment, task, how, content))
-    return [item(task) for task in assignment.tasks]
+        return [improve.item(assignment, how)]
+    if assignment.name == "bugs":
+        return [Item(f"7.{number} bug {number}", bugs.POINTS, partial(mark_bug, assignment, number, how))
+                for number in range(1, len(bugs.MUTANTS) + 1)]
+    return [Item(f"{task.number} {task.function}", task.points, partial(mark_task, assignment, task, how))
+            for task in assignment.tasks]
 
 
 # --- one submission ----------------------------------------------------------------------------------------------------

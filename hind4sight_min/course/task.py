@@ -4,10 +4,13 @@
 enters. Case i is answered with weights_seed=i.
 """
 import linecache
+import sys
 import traceback
 import warnings
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 
 import autograd.numpy as anp
 import numpy as np
@@ -91,7 +94,7 @@ def answer(task, function, case, weights_seed):
             warnings.simplefilter("ignore")
             value = _arrays(task.call(function, **_copy(case)))
     except Exception as error:
-        return Answer(error=_described(error))
+        return Answer(error=described(error))
     rng = np.random.default_rng(weights_seed)
     weights = [_weights(rng, each) if each.dtype.kind == "f" else None for each in value]
 
@@ -104,7 +107,7 @@ def answer(task, function, case, weights_seed):
             warnings.simplefilter("ignore")
             gradients = {name: np.asarray(grad(total, 1)(name, case[name].copy())) for name in task.gradient}
     except Exception as error:
-        return Answer(value, error=_described(error))
+        return Answer(value, error=described(error))
     return Answer(value, gradients)
 
 
@@ -131,7 +134,7 @@ def _weights(rng, value):
     return (signs * rng.uniform(0.5, 2, value.shape)).astype(value.dtype)
 
 
-def _described(error):
+def described(error):
     """One line of an exception, with the last line of the student's file that it went through."""
     text = f"{type(error).__name__}: {error}".split("\n")[0]
     frames = [frame for frame in traceback.extract_tb(error.__traceback__)
@@ -140,6 +143,15 @@ def _described(error):
         return text
     code = linecache.getline(frames[-1].filename, frames[-1].lineno).strip()
     return f"{text} (line {frames[-1].lineno}: {code})"
+
+
+def namespace_of(path):
+    """Run a student's file under a private name, never from a cache -> its names."""
+    module = ModuleType(f"student_{Path(path).stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses look for it there
+    exec(compile(Path(path).read_bytes(), str(path), "exec", dont_inherit=True), vars(module))
+    return vars(module)
 
 
 # --- where it does not -----------------------------------------------------------------------------------------------

@@ -123,7 +123,25 @@ def answer_task(file, number, cases):
             for each in answers_of(task, carve.load_student(file, task), cases)]
 
 
-WORK = {"task": answer_task}
+def measure_bug(file, number):
+    """What the student's measurement says of the package that lies beside this one."""
+    from hind4sight_min.course import bugs
+    folder = sys.path.pop(0)
+    return bugs.measure(file, number, bugs.import_package(folder))
+
+
+def improve(file, interactions, pokes, seed):
+    """The student's train(interactions, seed) -> predict, and predict(pokes) -> scene flow, an array."""
+    import numpy as np
+    from hind4sight_min.course.task import namespace_of
+    from hind4sight_min.geometry import Camera
+    from hind4sight_min.interactions import Interactions
+    data = [Interactions(**{**each, "camera": Camera(**each["camera"])}) for each in (interactions, pokes)]
+    predict = namespace_of(file)["train"](data[0], seed)
+    return np.asarray(predict(data[1]))
+
+
+WORK = {"task": answer_task, "bug": measure_bug, "improve": improve}
 
 
 # --- all of it ---------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce; `hind4sight COMMAND --help`."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `hind4sight COMMAND --help`."""
 import argparse
 import json
 import os
@@ -252,11 +252,6 @@ def click(image):
     return points[::2], points[1::2]
 
 
-def run_grade(args):
-    from ..course import grade_commands  # here: a course is not for everyone
-    grade_commands.run_grade(args)
-
-
 # --- the demo ----------------------------------------------------------------------------------------------
 
 DEMO_POKES, DEMO_TEST_POKES, DEMO_STEPS = 2000, 200, 1000
@@ -296,6 +291,18 @@ def run_demo(args):
     metrics["seconds"] = time.perf_counter() - began
     print(f"The whole demo took {metrics['seconds']:.0f} s.")
     write_json(args.json or found, {f"demo_{name}": value for name, value in metrics.items()})
+
+
+# --- the course --------------------------------------------------------------------------------------------
+
+def run_course(args):
+    from ..course.commands import run_course
+    run_course(args)
+
+
+def run_grade(args):
+    from ..course.grade_commands import run_grade
+    run_grade(args)
 
 
 # --- the command line -----------------------------------------------------------------------------------------
@@ -405,6 +412,13 @@ def build_parser():
     add("--pokes", metavar="FOLDER", help="assignment 8: the held-back pokes, with their truth (the shipped test set)")
     add("--out", default="results.json", help="in Gradescope's format, whole after every task (results.json)")
     add("--jobs", type=int, default=2, help="submissions at a time (2)")
+
+    add = command("course", run_course, "exercises for a class: list them, or start one in a folder of its own")
+    add("action", choices=("list", "start", "bundle"), help="bundle: the autograder of an exercise, for Gradescope")
+    add("name", nargs="?", help="number or name of the exercise")
+    add("--out", help="a new folder, or for the bundle a .zip (the exercise's name)")
+    add("--seed", metavar="FILE", help="bundle: of the held-back inputs (drawn)")
+    add("--pokes", metavar="FOLDER", help="bundle of assignment 8: the held-back pokes, with their truth")
     return parser
 
 

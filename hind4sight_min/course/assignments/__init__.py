@@ -4,7 +4,7 @@ To add a task, copy one of them in its file and change it; to add an assignment,
 """
 from dataclasses import dataclass
 
-from . import a1_camera, a2_chamfer
+from . import a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,12 @@ class Assignment:
 
 def _assignment(number, module):
     title, theory = module.__doc__.split("\n", 1)
-    return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(), module.TASKS, module.TESTS)
+    return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(),
+                      *(getattr(module, name, default) for name, default in (("TASKS", ()), ("TESTS", ()), ("files", None))))
 
 
-ASSIGNMENTS = _assignment(1, a1_camera), _assignment(2, a2_chamfer)
+ASSIGNMENTS = tuple(_assignment(number, module) for number, module in enumerate(
+    (a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs), 1))
 
 
 def assignment_of(name):
