@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from ..disk.files import write_json, write_text
-from . import blank, bugs, sandbox
+from . import blank, bugs, improve, sandbox
+from .assignments import a8_improve
 from .task import Answer, judge
 
 MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the file, bytes of a zip unpacked, its members
@@ -117,11 +118,11 @@ class Mark:
 
 @dataclass(frozen=True)
 class How:
-    """How to grade. seed: of the inputs; None for those that the student has (public). limits: of each process.
-    pokes: folder of assignment 8's, with their truth. namespaces: see sandbox.run.
+    """How to grade. seed: of the inputs; None for those that the student has (public). limits: of each process; None
+    for the usual ones. pokes: folder of assignment 8's, with their truth. namespaces: see sandbox.run.
     """
     seed: int = None
-    limits: sandbox.Limits = sandbox.Limits()
+    limits: sandbox.Limits = None
     pokes: str = None
     namespaces: bool = True
 
@@ -135,8 +136,8 @@ def mark_task(assignment, task, how, content):
     rng = np.random.default_rng(0 if how.seed is None else [how.seed, *map(int, task.number.split("."))])
     cases, file = task.cases(rng), f"{assignment.name}.py"
     outcome = sandbox.run(blank.package_for(task.name), {
-        "kind": "task", "files": {file: content}, "file": file, "number": task.number, "cases": cases}, how.limits,
-        how.namespaces)
+        "kind": "task", "files": {file: content}, "file": file, "number": task.number, "cases": cases},
+        how.limits or sandbox.Limits(), how.namespaces)
     if outcome.failure:
         return Mark(0.0, outcome.failure + (shown(outcome) if how.seed is None else ""), outcome.isolation)
     try:
@@ -181,7 +182,8 @@ def mark_bug(assignment, number, how, content):
     found, file = {}, f"{assignment.name}.py"
     for which in random.sample((0, number), 2):
         outcome = sandbox.run(blank.package_for(which), {
-            "kind": "bug", "files": {file: content}, "file": file, "number": number}, how.limits, how.namespaces)
+            "kind": "bug", "files": {file: content}, "file": file, "number": number},
+            how.limits or sandbox.Limits(), how.namespaces)
         found[which] = outcome.failure or measured(outcome.answer)
     verdict = bugs.judge(number, found[0], found[number])
     return Mark(verdict.share, sandbox.one_line(verdict.sentence) or "Right.", outcome.isolation)
@@ -194,10 +196,25 @@ def measured(answer):
     return answer if isinstance(answer, str) else "what came back is no answer"
 
 
+def mark_improved(assignment, how, content):
+    """Grade assignment 8 -> Mark: train in the student's process, score here. Not in the paper: grading."""
+    file = f"{assignment.name}.py"
+    job = improve.question(how.pokes, seed=0 if how.seed is None else how.seed % 2 ** 32)
+    outcome = sandbox.run(blank.package_for(), {"kind": "improve", "files": {file: content}, "file": file, **job},
+                          how.limits or improve.LIMITS, how.namespaces)
+    if outcome.failure:
+        return Mark(0.0, outcome.failure + (shown(outcome) if how.seed is None else ""), outcome.isolation)
+    try:
+        ratio, error = improve.score(outcome.answer, how.pokes)
+    except ValueError as error:
+        return Mark(0.0, str(error), outcome.isolation)
+    return Mark(improve.share_of(ratio), f"flow_mse_ratio {ratio:.4f} \u00b1 {error:.4f}", outcome.isolation)
+
+
 def items_of(assignment, how):
     """What an assignment's points are given for -> list of Items. Not in the paper: grading."""
     if assignment.name == "improve":
-        return [improve.item(assignment, how)]
+        return [Item("8.1 improve", a8_improve.POINTS, partial(mark_improved, assignment, how))]
     if assignment.name == "bugs":
         return [Item(f"7.{number} bug {number}", bugs.POINTS, partial(mark_bug, assignment, number, how))
                 for number in range(1, len(bugs.MUTANTS) + 1)]

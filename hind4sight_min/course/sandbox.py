@@ -20,12 +20,10 @@ import time
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
-import autograd
-import cv2
 import numpy as np
-import scipy
 
 from . import channel
 
@@ -201,7 +199,8 @@ def temporary_folder(user):
 
 def surroundings(package):
     """What a student's process sees of the disk, and what of that it does not: this very package."""
-    libraries = sorted({str(Path(module.__file__).parents[1]) for module in (np, scipy, cv2, autograd)})
+    libraries = sorted({str(Path(find_spec(name).origin).parents[1])
+                        for name in ("numpy", "scipy", "cv2", "autograd")})
     paths = ["/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", sys.base_prefix,
              sys.prefix, *libraries, str(package)]
     visible = []

@@ -4,7 +4,7 @@ To add a task, copy one of them in its file and change it; to add an assignment,
 """
 from dataclasses import dataclass
 
-from . import a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs
+from . import a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs, a8_improve
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def _assignment(number, module):
 
 
 ASSIGNMENTS = tuple(_assignment(number, module) for number, module in enumerate(
-    (a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs), 1))
+    (a1_camera, a2_chamfer, a3_warping, a4_smoothness, a5_inverse, a6_planning, a7_bugs, a8_improve), 1))
 
 
 def assignment_of(name):
