@@ -37,12 +37,15 @@ def scores(content, *functions, how=HOW):
             [test["output"] for test in results["tests"]])
 
 
+NOTHING = {"kind": "task", "files": {}, "file": "none.py", "number": "2.1", "cases": []}
+
+
 def left_behind():
     """Processes of the user ids that students' code runs under."""
     return [user for user in sandbox.tasks_by_user() if 60100 <= user < 64900]
 
 
-# --- right and wrong --------------------------------------------------------------------------------------------------
+# --- right and wrong ---------------------------------------------------------------------------------------------
 
 def test_the_reference_gets_all_points_and_the_skeleton_none(tmp_path):
     functions = "chamfer_loss", "nearest_squared_distances"
@@ -72,7 +75,7 @@ def test_held_back_inputs_do_not_come_out_by_an_exception():
     assert "array" in sentence, "with public inputs it helps"
 
 
-# --- hostile ----------------------------------------------------------------------------------------------------------
+# --- hostile -----------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("name", grade_class.HOSTILE)
 def test_an_attack_gets_no_points_and_costs_none(name, tmp_path):
@@ -108,14 +111,12 @@ def test_no_network(tmp_path):
         source = f"import socket\nsocket.create_connection(('127.0.0.1', {server.getsockname()[1]}), 5)\n" + \
                  grade_class.FILE.format(seed_folder="", body="        pass")
         (test,) = grading.grade(items("seen_in_both"), source.encode())["tests"]
-        results = sandbox.run(blank.package_for(), job := {"kind": "task", "files": {}, "file": "none.py", "number": "2.1",
-                                                           "cases": []}, SHORT)
-    if "network" not in results.isolation:
-        pytest.skip(f"this kernel does not give {os.getuid()} a network of its own: {results.isolation}, {job['kind']}")
+    if "network" not in sandbox.run(blank.package_for(), NOTHING, SHORT).isolation:
+        pytest.skip("this kernel gives this user no network of its own")
     assert test["score"] == 0 and "rror" in test["output"]
 
 
-# --- what comes through the pipe ----------------------------------------------------------------------------------------
+# --- what comes through the pipe ---------------------------------------------------------------------------------
 
 def test_a_message_comes_back_as_it_was():
     value = {"a": [1, 2.5, None, "x", True], "b": {"c": np.arange(6.0).reshape(2, 3), "d": np.float32(2)},
@@ -134,7 +135,8 @@ def npy(text):
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"),
     npy("{'descr': '|O', 'fortran_order': False, 'shape': (0,)}"),
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"),
-    npy("{'descr': '<f8', 'fortran_order': False, 'shape': ()}") + b"1234", npy("__import__('os')._exit(1)"), b"", b"\0"])
+    npy("{'descr': '<f8', 'fortran_order': False, 'shape': ()}") + b"1234",
+    npy("__import__('os')._exit(1)"), b"", b"\0"])
 def test_arrays_that_are_not_what_they_say_are_refused(content):
     with pytest.raises(ValueError):
         channel.decode([b'{"npy": 0}', memoryview(content)])
@@ -146,7 +148,7 @@ def test_json_that_is_not_ours_is_refused(text):
         channel.decode([text])
 
 
-# --- submissions --------------------------------------------------------------------------------------------------------
+# --- submissions -------------------------------------------------------------------------------------------------
 
 def zipped(path, **members):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -193,7 +195,7 @@ def test_what_is_too_large_or_leads_outside_is_refused_in_one_line(tmp_path):
     assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 10
 
 
-# --- results ------------------------------------------------------------------------------------------------------------
+# --- results -----------------------------------------------------------------------------------------------------
 
 def test_results_are_on_disk_before_the_first_task_and_after_each(tmp_path):
     seen, path = [], tmp_path / "results.json"
@@ -230,8 +232,8 @@ def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_pat
 
 def test_a_killed_grader_leaves_whole_results_and_no_process(tmp_path):
     (tmp_path / "chamfer.py").write_text(grade_class.hostile("endless loop"))
-    process = subprocess.Popen([sys.executable, "-m", "hind4sight_min", "grade", tmp_path / "chamfer.py", "--task", "2.5",
-                                "--out", tmp_path / "results.json"], env={**os.environ, "PYTHONPATH": str(ROOT)})
+    process = subprocess.Popen([sys.executable, "-m", "hind4sight_min", "grade", tmp_path / "chamfer.py", "--task",
+                                "2.5", "--out", tmp_path / "results.json"], env={**os.environ, "PYTHONPATH": str(ROOT)})
     while not left_behind() and process.poll() is None and os.getuid() == 0:
         time.sleep(0.05)
     time.sleep(0.5)

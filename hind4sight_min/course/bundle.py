@@ -66,7 +66,7 @@ def write_bundle(assignment, out, seed=None, pokes=None):
     """
     out = Path(out)
     if assignment.name == "improve" and not pokes:
-        raise ValueError("--pokes: assignment 8 is scored on pokes that students do not have; hind4sight collect makes some")
+        raise ValueError("--pokes: assignment 8 is scored on pokes that students do not have; `collect` makes some")
     if out.suffix != ".zip" and out.exists():
         raise ValueError(f"out: expected a new folder or a .zip, got {out}")
     with tempfile.TemporaryDirectory() as temporary:
@@ -74,7 +74,8 @@ def write_bundle(assignment, out, seed=None, pokes=None):
         shutil.copytree(PACKAGE, folder / "package" / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copytree(data_small() / "train", folder / "package" / "data_small" / "train",
                         ignore=shutil.ignore_patterns("*.truth.npz"))
-        names = [each for each in requires("hind4sight_min") if "extra ==" not in each and not each.startswith(NOT_NEEDED)]
+        names = [each for each in requires("hind4sight_min")
+                 if "extra ==" not in each and not each.startswith(NOT_NEEDED)]
         (folder / "package" / "pyproject.toml").write_text(
             PROJECT % (__version__, ", ".join(f'"{each}"' for each in names)))
         if pokes:

@@ -53,7 +53,7 @@ def encode(value):
 
 
 def load_npy(content):
-    """The array in the bytes of a .npy file. Raises ValueError unless it holds real numbers, exactly as many as it says.
+    """The array in the bytes of a .npy file. Raises ValueError unless it has as many real numbers as it says.
 
     Not in the paper: a header may claim terabytes, or a type that runs code.
     """
@@ -77,7 +77,8 @@ def decode(contents):
     """
     try:
         arrays = [load_npy(content) for content in contents[1:]]
-        return json.loads(bytes(contents[0]), object_hook=lambda each: arrays[each["npy"]] if [*each] == ["npy"] else each)
+        return json.loads(bytes(contents[0]),
+                          object_hook=lambda each: arrays[each["npy"]] if [*each] == ["npy"] else each)
     except MemoryError:
         raise
     except Exception as error:  # damage can surface as almost anything: struct, JSON, NumPy, too deep a nesting

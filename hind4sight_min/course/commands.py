@@ -11,7 +11,7 @@ def run_course(args):
             print(f"{each.number}  {each.name:<12}{each.title}")
         return
     if args.name is None:
-        raise ValueError(f"course {args.action}: expected the number or the name of an assignment; `course list` has them")
+        raise ValueError(f"course {args.action}: expected an assignment's number or name; `course list` has them")
     assignment = assignment_of(args.name)
     if args.action == "bundle":
         out = args.out or f"{assignment.name}.zip"

@@ -25,10 +25,10 @@ from . import blank, bugs, improve, sandbox
 from .assignments import a8_improve
 from .task import Answer, judge
 
-MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the file, bytes of a zip unpacked, its members
+MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the file, of a zip unpacked; its files
 
 
-# --- a submission ------------------------------------------------------------------------------------------------------
+# --- a submission ------------------------------------------------------------------------------------------------
 
 def in_order(text):
     """A key that sorts names as people count: attempt 2 before attempt 10. Not in the paper: grading."""
@@ -98,7 +98,7 @@ def read_zip(path, name):
     return content, f"{path}: {found[-1].filename}"
 
 
-# --- one task ----------------------------------------------------------------------------------------------------------
+# --- one task ----------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
 class Item:
@@ -222,7 +222,7 @@ def items_of(assignment, how):
             for task in assignment.tasks]
 
 
-# --- one submission ----------------------------------------------------------------------------------------------------
+# --- one submission ----------------------------------------------------------------------------------------------
 
 def grade(items, content, out=None, only=None, note="", on_item=None):
     """Grade a submission's bytes -> the results, a dict in Gradescope's format.
@@ -266,7 +266,7 @@ def table(results):
     return "\n".join([*lines, f"isolation: {results['extra_data']['isolation'] or 'nothing was run'}"])
 
 
-# --- a class -----------------------------------------------------------------------------------------------------------
+# --- a class -----------------------------------------------------------------------------------------------------
 
 ATTEMPT = re.compile(r"[ _-]*\(?\b(attempt|version|v)[ _-]*\d+\)?$", re.IGNORECASE)
 

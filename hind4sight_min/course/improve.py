@@ -17,7 +17,7 @@ LIMITS = Limits(cpu=60 * MINUTES, wall=180.0 * MINUTES, memory=3 << 30, processe
 def question(folder, seed):
     """Training pokes, and the pokes to predict without what came of them -> the arguments of `worker.improve`.
 
-    Not in the paper: grading. Nothing but the settings of the simulator goes along: with its seed, pokes can be repeated.
+    Not in the paper: grading. Nothing but the simulator's settings goes along: with its seed, pokes can be repeated.
     """
     pokes = load_interactions(folder or data_small() / "test")
     blind = replace(pokes, rgb_after=pokes.rgb_before, depth_after=pokes.depth_before)

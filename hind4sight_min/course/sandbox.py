@@ -123,8 +123,8 @@ def outcome(content, ending, code, prints, limits):
     parts, whole = channel.frames(content)
     if len(parts) < 2 or bytes(parts[1]) != b"ready":  # what comes before that is not the student's
         last = prints.strip().splitlines()[-1:] or [f"exit status {code}"]
-        raise RuntimeError(f"sandbox: the student's process cannot begin ({last[0]}); {sys.executable} and its packages "
-                           "must be readable for every user, and the limits large enough to import NumPy")
+        raise RuntimeError(f"sandbox: the student's process cannot begin ({last[0]}); {sys.executable} and its "
+                           "packages must be readable for every user, the limits large enough to import NumPy")
     in_force = [name for name, holds in json.loads(bytes(parts[0])).items() if holds]
     answer, failure = None, ""
     if ending == "size":
@@ -150,7 +150,7 @@ def one_line(text, most=300):
     return "".join(each if each.isprintable() else "?" for each in line)[:most]
 
 
-# --- users, folders, what is to be seen -------------------------------------------------------------------------------
+# --- users, folders, what is to be seen --------------------------------------------------------------------------
 
 TAKEN, LOCK = set(), threading.Lock()
 

@@ -112,7 +112,7 @@ def watch(child, order, apart):
     os._exit(code if code >= 0 else 128 - code)
 
 
-# --- what the student's code is asked, once it is shut in --------------------------------------------------------------
+# --- what the student's code is asked, once it is shut in --------------------------------------------------------
 
 def answer_task(file, number, cases):
     """The answers of one task's function on its cases, as `task.answer` gives them, in plain types."""
@@ -144,7 +144,7 @@ def improve(file, interactions, pokes, seed):
 WORK = {"task": answer_task, "bug": measure_bug, "improve": improve}
 
 
-# --- all of it ---------------------------------------------------------------------------------------------------------
+# --- all of it ---------------------------------------------------------------------------------------------------
 
 def main(order):
     """Shut in, then answer what the grader asks on order["inputs"]; the answer goes to order["results"]."""

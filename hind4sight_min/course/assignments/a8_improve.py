@@ -5,9 +5,9 @@ labels. The paper's model trained for a hundred steps on them predicts half of t
 
 There is no one way, and that is the point. Train longer, and see when it stops to help. Weigh the terms of Eq. (6)
 differently; leave one out and say what it was good for. More noise, fewer masks, another width, another optimiser or
-schedule. Pokes can be mirrored and turned, for the table does not mind. Several models can be averaged. Measure on pokes
-that you did not train on, with the standard error beside it, and change one thing at a time: of two runs that differ by
-less than that, neither is better.
+schedule. Pokes can be mirrored and turned, for the table does not mind. Several models can be averaged. Measure on
+pokes that you did not train on, with the standard error beside it, and change one thing at a time: of two runs that
+differ by less than that, neither is better.
 """
 POINTS, MINUTES = 100, 10  # of CPU
 BASELINE, TARGET = 0.6, 0.3  # flow_mse_ratio that earns nothing, and all: see docs/teaching.md
@@ -46,9 +46,9 @@ README = """# Assignment {number}: {title}
 ## What to do
 
 Change `improve.py`, all of it if you like. `train(interactions, seed)` is given 400 pokes and returns a function
-`predict(pokes)`. You have {minutes} minutes of CPU for both together, one process, one thread, 3 GB of memory, no network,
-and of libraries this package and what it needs. Whatever you learn from, it is these 400 pokes: a file of parameters does
-not go along, only `improve.py` is read.
+`predict(pokes)`. You have {minutes} minutes of CPU for both together, one process, one thread, 3 GB of memory, no
+network, and of libraries this package and what it needs. Whatever you learn from, it is these 400 pokes: a file of
+parameters does not go along, only `improve.py` is read.
 
 ## How to check
 
