@@ -9,6 +9,7 @@ import marshal
 import math
 import sys
 import tempfile
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -124,9 +125,13 @@ def measure(path, number, package):
     hidden = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == PACKAGE.name}
     sys.modules.update(dict.fromkeys(hidden))
     try:
-        namespace = namespace_of(path)
-        low, high = (float(each) for each in namespace[f"EXPECTED_{number:02}"])
-        return low, high, float(namespace[f"measure_{number:02}"](package))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            namespace = namespace_of(path)
+            expected = namespace.get(f"EXPECTED_{number:02}")
+            if not isinstance(expected, tuple) or len(expected) != 2:
+                raise ValueError(f"EXPECTED_{number:02}: expected (low, high), got {expected}")
+            return float(expected[0]), float(expected[1]), float(namespace[f"measure_{number:02}"](package))
     except Exception as error:
         return described(error)
     finally:

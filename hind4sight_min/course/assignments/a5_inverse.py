@@ -27,7 +27,7 @@ from autograd.tracer import getval
 from ...interactions import cell_centres, cells_of
 from ...lab.evaluation import poke_from_heatmaps
 from ...losses import embedding_loss, heatmap_cross_entropy
-from ...networks import STATE_GAIN, Sizes, encode, init_parameters, softmax, state_embedding
+from ...networks import STATE_GAIN, encode, softmax, state_embedding
 from ..task import Task, single
 
 
@@ -88,10 +88,15 @@ def state_cases(rng):
     return [fixed, drawn((2, 6)), single(drawn((2, 6)))]
 
 
+LAYERS = {"encoder_1_w": np.random.default_rng(0).normal(size=(20, 4)) / 4, "encoder_1_b": np.zeros(4),
+          "encoder_2_b": np.zeros(4)}
+
+
 def embedded(function, points, weights, occupied):
     """With an encoder of four features, the same at every call but for the weights of its second layer."""
-    params = init_parameters(Sizes(embedding=4), np.random.default_rng(0), getval(points).dtype)
-    return function({**params, "encoder_2_w": weights}, points, occupied)
+    dtype = getval(points).dtype
+    return function({**{name: value.astype(dtype) for name, value in LAYERS.items()}, "encoder_2_w": weights}, points,
+                    occupied)
 
 
 def summed(params, points, weights):

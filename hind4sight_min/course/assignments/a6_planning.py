@@ -50,16 +50,17 @@ def refitted(change):
 # --- starts ---
 
 def start_cases(rng):
-    block = np.zeros((1, 5, 5), int)
-    block[0, 2, 2] = 1
-    by_hand = {"pokes": np.array([[0.0, 0, 0], [0.0, 0, np.pi / 2], [0.2, 0.2, 0]]), "grid": np.repeat(block, 3, axis=0),
-               "arena": 0.5, "cell": 0.1, "lengths": 2}
-    pokes = rng.uniform(-1, 1, (40, 3)) * [0.26, 0.26, np.pi]
-    grid = np.zeros((40, 20, 20), int)
-    rows, columns = rng.integers(20, size=(2, 40, 5))
-    grid[np.arange(40)[:, None], rows, columns] = 1
+    block = np.zeros((3, 6, 6), int)
+    block[:, 3, 4] = 1  # pokes: along x; from the wall; on nothing
+    by_hand = {"pokes": np.array([[0.07, 0.01, 0], [0.07, 0.01, np.pi], [-0.1, -0.1, 0]]), "grid": block,
+               "arena": 0.3, "cell": 0.05, "lengths": 2}
+    pokes = rng.uniform(-1, 1, (40, 3)) * [0.2, 0.2, np.pi]
+    pokes[:5, 0], pokes[:5, 2] = 0.26, 0  # outside of the wall, pushed from inside
     beside = pokes[:, :2] + [0.025, 0] * (np.arange(40) % 2)[:, None]  # half of the targets are on, half next to it
-    grid.reshape(40, -1)[np.arange(40), cells_of(beside, {"arena": 0.5, "cell": 0.025})] = 1
+    grid = np.zeros((40, 20, 20), int)
+    grid.reshape(40, -1)[np.arange(30), cells_of(beside, {"arena": 0.5, "cell": 0.025})[:30]] = 1  # the last: no object
+    for block in grid[5:]:
+        block[rng.integers(20, size=9), rng.integers(20, size=9)] = 1
     return [by_hand, {"pokes": pokes, "grid": grid, "arena": 0.5, "cell": 0.025, "lengths": 5}]
 
 
