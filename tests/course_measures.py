@@ -57,7 +57,8 @@ def measure_05(package):
     """The same of a layer with a residual, below its kink while the output is above 0."""
     from autograd import grad
     def layer(bias):
-        return package.ops.dense(np.array([[3.0]]), np.array([[1.0]]), bias * np.ones(1), leaky=True, residual=True)[0, 0]
+        x, weight = np.array([[3.0]]), np.array([[1.0]])
+        return package.ops.dense(x, weight, bias * np.ones(1), leaky=True, residual=True)[0, 0]
     return grad(layer)(-5.0) / slope(layer, -5.0)
 
 

@@ -138,7 +138,7 @@ def yours(request, monkeypatch):
         carve.put_in_place(Path(__file__).with_name("{name}.py"), request.module, monkeypatch)
 '''
 
-TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of task 2.1. The other tasks' functions are the reference's here."""
+TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of 2.1. Other tasks' functions are the reference's here."""
 from pathlib import Path
 
 import pytest
@@ -199,8 +199,8 @@ points, H x W pixels. {points} points, about {minutes} minutes.
     pytest -q                 # and the reference's own tests, with your functions in place of its own
 
 `test_tasks.py` compares shape, dtype, finite numbers, values and gradients, in this order, first on the case by hand
-below. Where it recognises a mistake it says which. There a task does not depend on the others: they are the reference's.
-The reference's own tests ({tests}) run your functions together, so they pass once all are written.
+below. Where it recognises a mistake it says which. A task does not depend on the others there: they are the
+reference's. The reference's own tests ({tests}) run your functions together, so they pass once all are written.
 
 ## Cases by hand
 

@@ -17,9 +17,9 @@ import numpy as np
 from autograd import grad
 
 
-def by_name(function, **case):
-    """The usual `call`: a case holds the function's arguments as they are."""
-    return function(**case)
+def plain_call(function, **case):
+    """The usual `call`: a case holds the function's arguments, in their order."""
+    return function(*case.values())
 
 
 def single(case):
@@ -34,9 +34,9 @@ class Task:
 
     number: "2.1". name: of the reference, "losses.chamfer_loss": module.function inside hind4sight_min. title: what to
     do, in one line. points, minutes: what it is worth, and takes.
-    cases: rng -> list of dicts of arguments, arrays or JSON scalars: the first fixed and small enough to do by hand, the
-    others drawn, one of them in float32. call: (function, **case) -> array or tuple of arrays, which makes cameras or
-    records of arrays; autograd can differentiate it. gradient: the arguments whose gradient counts for half of the
+    cases: rng -> list of dicts of arguments, arrays or JSON scalars: the first fixed and small enough to do by hand,
+    the others drawn, one of them in float32. call: (function, **case) -> array or tuple of arrays, which makes cameras
+    or records of arrays; autograd can differentiate it. gradient: the arguments whose gradient counts for half of the
     points. mistakes: what to say of a wrong answer -> a function that gives it. notes: more for the student, which is
     the docstring where the reference has none.
     """
@@ -46,7 +46,7 @@ class Task:
     points: int
     minutes: int
     cases: callable
-    call: callable = by_name
+    call: callable = plain_call
     gradient: tuple = ()
     mistakes: dict = field(default_factory=dict)
     notes: str = ""

@@ -23,8 +23,8 @@ class Assignment:
 
 def _assignment(number, module):
     title, theory = module.__doc__.split("\n", 1)
-    return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(),
-                      *(getattr(module, name, default) for name, default in (("TASKS", ()), ("TESTS", ()), ("files", None))))
+    return Assignment(number, module.__name__.rpartition("_")[2], title, theory.strip(), getattr(module, "TASKS", ()),
+                      getattr(module, "TESTS", ()), getattr(module, "files", None))
 
 
 ASSIGNMENTS = tuple(_assignment(number, module) for number, module in enumerate(

@@ -22,8 +22,8 @@ help, and so does a tiny number under the root.
 
     P' = sum_k m^k (R^k P + T^k).
 
-**The poke's frame.** The model sees everything from the poke u = (a_x, a_y, a_theta): origin at its target on the table,
-x along its direction, so that p_arena = Q p_poke + o, with Q a turn by a_theta about z.
+**The poke's frame.** The model sees everything from the poke u = (a_x, a_y, a_theta): origin at its target on the
+table, x along its direction, so that p_arena = Q p_poke + o, with Q a turn by a_theta about z.
 
 Paper: Sec. III-A (Eq. 1) and III-C; lessons 01_point_clouds and 02_rigid_motion.
 """
@@ -32,7 +32,8 @@ from dataclasses import replace
 import autograd.numpy as anp
 import numpy as np
 
-from ...geometry import CROSS, Camera, optical_flow, poke_axes, project, rigid, so3_exp, transform_layer, unproject
+from ...geometry import (CROSS, Camera, optical_flow, poke_axes, poke_frame, project, rigid, so3_exp, transform_layer,
+                         unproject)
 from ..task import Task, single
 
 DOWN = np.array([[1.0, 0, 0, 0.2], [0, -1, 0, 0.1], [0, 0, -1, 2], [0, 0, 0, 1]])  # a camera 2 m above, looking down
@@ -152,61 +153,60 @@ def poke_cases(rng):
 
 
 TASKS = (
-    Task("1.1", "geometry.unproject", "Depth picture to points in the arena", 20, 30, depth_cases, from_depth, ("depth",),
-         {"The points are still in the camera's frame": lambda depth, camera: unproject(depth, at(camera, np.eye(4))),
-          "arena_from_camera was inverted": lambda depth, camera: unproject(depth, at(camera, camera.camera_from_arena)),
-          "fx and fy swapped": lambda depth, camera: unproject(depth, replace(camera, fx=camera.fy, fy=camera.fx)),
-          "The picture's middle instead of the principal point (cx, cy)": lambda depth, camera:
-              unproject(depth, replace(camera, cx=camera.width / 2, cy=camera.height / 2)),
-          "Depth is along the optical axis, not along each pixel's ray": along_the_ray}),
-    Task("1.2", "geometry.project", "Points to pixels, never infinite", 20, 20, point_cases, of_points, ("points",),
-         {"The points were not brought into the camera's frame": lambda points, camera:
-             project(points, at(camera, np.eye(4))),
-          "arena_from_camera instead of camera_from_arena": lambda points, camera:
-              project(points, at(camera, camera.camera_from_arena)),
-          "fx for both axes": lambda points, camera: project(points, replace(camera, fy=camera.fx)),
-          "The principal point (cx, cy) was not added": lambda points, camera:
-              project(points, replace(camera, cx=0.0, cy=0.0)),
-          "x and y swapped": lambda points, camera: project(points, camera)[..., ::-1],
-          "Right but for points behind the camera: Z must be at least MIN_DEPTH": without_least_depth}),
+    Task("1.1", "geometry.unproject", "Depth picture to points in the arena", 20, 30, depth_cases, from_depth,
+         gradient=("depth",), mistakes={
+             "The points are still in the camera's frame":
+                 lambda depth, camera: unproject(depth, at(camera, np.eye(4))),
+             "arena_from_camera was inverted":
+                 lambda depth, camera: unproject(depth, at(camera, camera.camera_from_arena)),
+             "fx and fy swapped":
+                 lambda depth, camera: unproject(depth, replace(camera, fx=camera.fy, fy=camera.fx)),
+             "The picture's middle instead of the principal point (cx, cy)":
+                 lambda depth, camera: unproject(depth, replace(camera, cx=camera.width / 2, cy=camera.height / 2)),
+             "Depth is along the optical axis, not along each pixel's ray": along_the_ray}),
+    Task("1.2", "geometry.project", "Points to pixels, never infinite", 20, 20, point_cases, of_points,
+         gradient=("points",), mistakes={
+             "The points were not brought into the camera's frame":
+                 lambda points, camera: project(points, at(camera, np.eye(4))),
+             "arena_from_camera instead of camera_from_arena":
+                 lambda points, camera: project(points, at(camera, camera.camera_from_arena)),
+             "fx for both axes": lambda points, camera: project(points, replace(camera, fy=camera.fx)),
+             "The principal point (cx, cy) was not added":
+                 lambda points, camera: project(points, replace(camera, cx=0.0, cy=0.0)),
+             "x and y swapped": lambda points, camera: project(points, camera)[..., ::-1],
+             "Right but for points behind the camera: Z must be at least MIN_DEPTH": without_least_depth}),
     Task("1.3", "geometry.optical_flow", "By how many pixels a motion moves each point", 10, 5, motion_cases, of_motion,
-         ("points", "predicted"),
-         {"Minus the flow": lambda points, predicted, camera: optical_flow(predicted, points, camera),
-          "x and y swapped": lambda points, predicted, camera: optical_flow(points, predicted, camera)[..., ::-1],
-          "Where the points end, not by how much they moved": lambda points, predicted, camera:
-              project(predicted, camera),
-          "The motion was projected as if it were a point": lambda points, predicted, camera:
-              project(predicted - points, camera)}),
+         gradient=("points", "predicted"), mistakes={
+             "Minus the flow": lambda points, predicted, camera: optical_flow(predicted, points, camera),
+             "x and y swapped": lambda points, predicted, camera: optical_flow(points, predicted, camera)[..., ::-1],
+             "Where the points end, not by how much they moved":
+                 lambda points, predicted, camera: project(predicted, camera),
+             "The motion was projected as if it were a point":
+                 lambda points, predicted, camera: project(predicted - points, camera)}),
     Task("1.4", "geometry.so3_exp", "Rodrigues' formula, also where nothing turns", 20, 40, rotation_cases,
          gradient=("rotation_vector",), mistakes={
-             "Turned the other way: the sign of [w]x": lambda rotation_vector: so3_exp(-rotation_vector),
-             "NaN where nothing turns: sin(t) / t is 0 / 0 at t = 0": lambda rotation_vector:
-                 rodrigues(rotation_vector, lambda t: anp.sin(t) / t, lambda t: (1 - anp.cos(t)) / t ** 2),
-             "Only the small-angle part I + [w]x": lambda rotation_vector:
-                 rodrigues(rotation_vector, lambda t: 1.0, lambda t: 0.0),
-             "np.sinc(x) is sin(pi x) / (pi x)": lambda rotation_vector:
-                 rodrigues(rotation_vector, anp.sinc, lambda t: anp.sinc(t / 2) ** 2 / 2)},
-         notes="The matrices may be composed of `CROSS`, which makes [w]x of w by one product."),
+             "Turned the other way: the sign of [w]x": lambda w: so3_exp(-w),
+             "NaN where nothing turns: sin(t) / t is 0 / 0 at t = 0":
+                 lambda w: rodrigues(w, lambda t: anp.sin(t) / t, lambda t: (1 - anp.cos(t)) / t ** 2),
+             "Only the small-angle part I + [w]x": lambda w: rodrigues(w, lambda t: 1.0, lambda t: 0.0),
+             "np.sinc(x) is sin(pi x) / (pi x)": lambda w: rodrigues(w, anp.sinc, lambda t: anp.sinc(t / 2) ** 2 / 2)},
+         notes="The product of w with `CROSS`, (3, 9), makes [w]x, row by row."),
     Task("1.5", "geometry.transform_layer", "Every point moved by the masks' mean motion, Eq. (1)", 20, 30, layer_cases,
          gradient=("points", "masks", "rotations", "translations"), mistakes={
-             "R transposed: rows times R instead of R times columns": lambda points, masks, rotations, translations:
-                 transform_layer(points, masks, anp.swapaxes(rotations, 2, 3), translations),
-             "The translation is missing": lambda points, masks, rotations, translations:
-                 transform_layer(points, masks, rotations, 0 * translations),
+             "R transposed: rows times R instead of R times columns":
+                 lambda p, m, r, t: transform_layer(p, m, anp.swapaxes(r, 2, 3), t),
+             "The translation is missing": lambda p, m, r, t: transform_layer(p, m, r, 0 * t),
              "Translated first, then rotated": translated_first,
-             "The translations are not weighted by the masks": lambda points, masks, rotations, translations:
-                 transform_layer(points, masks, rotations, 0 * translations) + anp.sum(translations, 1)[:, None],
+             "The translations are not weighted by the masks":
+                 lambda p, m, r, t: transform_layer(p, m, r, 0 * t) + anp.sum(t, 1)[:, None],
              "The motion was added to the point, which R P + T holds already":
-                 lambda points, masks, rotations, translations:
-                 points + transform_layer(points, masks, rotations, translations)}),
+                 lambda p, m, r, t: p + transform_layer(p, m, r, t)}),
     Task("1.6", "geometry.poke_frame", "Points as each poke sees them", 10, 15, poke_cases, mistakes={
-        "Turned the other way: the inverse of Q is its transpose": lambda points, pokes: np.matmul(
-            points - poke_axes(pokes)[1][:, None], np.swapaxes(poke_axes(pokes)[0], 1, 2)),
-        "Turned before it was shifted": lambda points, pokes:
-            np.matmul(points, poke_axes(pokes)[0]) - poke_axes(pokes)[1][:, None],
-        "From the poke's frame to the arena, not back": lambda points, pokes: np.matmul(
-            points, np.swapaxes(poke_axes(pokes)[0], 1, 2)) + poke_axes(pokes)[1][:, None],
+        "Turned the other way: the inverse of Q is its transpose":
+            lambda points, pokes: poke_frame(points, pokes * [1, 1, -1]).astype(points.dtype),
+        "Turned before it was shifted":
+            lambda points, pokes: np.matmul(points, poke_axes(pokes)[0]) - poke_axes(pokes)[1][:, None],
         "Not shifted to the target": lambda points, pokes: np.matmul(points, poke_axes(pokes)[0])},
-        notes="`poke_axes` gives Q and o."),
+         notes="`poke_axes` gives Q and o."),
 )
 TESTS = ("eq1_transform",)

@@ -7,8 +7,8 @@ for its nearest neighbour in the other cloud:
     L_CD = sum_i D_{P'->P}(i) + sum_j D_{P->P'}(j)                                             Eq. (2)
 
 Squared, both ways, summed. As pictures on the pixels the points come from, the two are *distance maps*, the first on
-frame t's grid, the second on frame t+1's. Pixels without depth neither attract (no valid neighbour) nor cost anything (0
-in the map).
+frame t's grid, the second on frame t+1's. Pixels without depth neither attract (they are nobody's neighbour) nor cost
+anything (0 in their map).
 
 **The neighbours** come from a KD-tree (`scipy.spatial.cKDTree`), which autograd knows nothing of. So the distance to a
 *given* neighbour is a primitive, and its derivative is written by hand as a VJP (vector-Jacobian product): from g, the
@@ -122,67 +122,57 @@ def seen_cases(rng):
 TASKS = (
     Task("2.1", "ops.squared_distances", "The squared distance of each query to a given reference", 10, 10,
          distance_cases, mistakes={
-             "The distance, not its square": lambda queries, references, indices:
-                 np.sqrt(squared_distances(queries, references, indices)),
-             "The mean over the coordinates instead of the sum": lambda queries, references, indices:
-                 ((queries - references[indices]) ** 2).mean(axis=1),
-             "Each query with the reference of its own number: `indices` says which one": lambda queries, references,
-                 indices: squared_distances(queries, references, np.arange(len(queries)) % len(references)),
-             "All coordinates and points summed into one number": lambda queries, references, indices:
-                 squared_distances(queries, references, indices).sum()},
-         notes="An autograd primitive: it sees plain arrays, and so its body is NumPy."),
-    Task("2.2", "ops._squared_distances_vjp", "Its VJP, written by hand", 25, 40, pull_cases, both_gradients, mistakes={
-        "Half of it: the square's factor 2 is missing": pulls(lambda g: g[:, None], collected),
-        "The sign of the references' gradient": pulls(lambda g: 2 * g[:, None], lambda *args: collected(*args, sign=1)),
-        "A reference that is nearest to several keeps only the last of them: collect from all": pulls(
-            lambda g: 2 * g[:, None], last_only),
-        "g is missing: a VJP gives the gradient of a scalar further on": pulls(lambda g: 2, collected)},
-        notes="args are (queries, references, indices), ans their distances, and argnums tell which gradients are asked "
-              "for, 0 the queries', 1 the references'. It returns a function vjp(g) that returns a list with a gradient "
-              "for each of argnums, of the shape and dtype of its input."),
-    Task("2.3", "ops.nearest_squared_distances", "Every query's squared distance to its nearest valid reference", 25, 30,
-         nearest_cases, gradient=("queries", "references"), mistakes={
-             "The distance, not its square": lambda queries, references, valid:
-                 anp.sqrt(nearest_squared_distances(queries, references, valid)),
-             "References that are not valid attract": lambda queries, references, valid:
-                 nearest_squared_distances(queries, references, valid | True),
+             "The distance, not its square": lambda q, r, indices: np.sqrt(squared_distances(q, r, indices)),
+             "The mean over the coordinates instead of the sum":
+                 lambda q, r, indices: ((q - r[indices]) ** 2).mean(axis=1),
+             "Each query with the reference of its own number: `indices` says which one":
+                 lambda q, r, indices: squared_distances(q, r, np.arange(len(q)) % len(r)),
+             "Summed over the points too": lambda q, r, indices: squared_distances(q, r, indices).sum()},
+         notes="An autograd primitive: it sees plain arrays, so its body is NumPy."),
+    Task("2.2", "ops._squared_distances_vjp", "The VJP of squared_distances, by hand", 25, 40, pull_cases,
+         both_gradients, mistakes={
+             "Half of it: the square's factor 2 is missing": pulls(lambda g: g[:, None], collected),
+             "The sign of the references' gradient":
+                 pulls(lambda g: 2 * g[:, None], lambda *args: collected(*args, sign=1)),
+             "A reference that is nearest to several keeps only the last of them: collect from all":
+                 pulls(lambda g: 2 * g[:, None], last_only),
+             "g is missing: a VJP gives the gradient of a scalar further on": pulls(lambda g: 2, collected)},
+         notes="args are (queries, references, indices), kwargs is empty, ans are the distances, and argnums says "
+               "whose gradients are asked for: 0 the queries', 1 the references'. It returns a function vjp(g), g "
+               "(N,), that returns a list: for each of argnums the gradient, in the shape and dtype of that input."),
+    Task("2.3", "ops.nearest_squared_distances", "Every query's squared distance to its nearest valid reference", 25,
+         30, nearest_cases, gradient=("queries", "references"), mistakes={
+             "The distance, not its square": lambda q, r, valid: anp.sqrt(nearest_squared_distances(q, r, valid)),
+             "References that are not valid attract": lambda q, r, valid: nearest_squared_distances(q, r, valid | True),
              "Neighbours are sought in the whole batch": all_in_one,
-             "No gradient to the references": lambda queries, references, valid:
-                 nearest_squared_distances(queries, getval(references), valid),
-             "No gradient to the queries": lambda queries, references, valid:
-                 nearest_squared_distances(getval(queries), references, valid)},
-         notes="Find neighbours in plain arrays (`getval` takes them out of autograd's boxes), then let "
-               "`squared_distances` say how far they are. How it is found does not matter here: brute force counts."),
+             "No gradient to the references": lambda q, r, valid: nearest_squared_distances(q, getval(r), valid),
+             "No gradient to the queries": lambda q, r, valid: nearest_squared_distances(getval(q), r, valid)},
+         notes="Find the neighbours in plain arrays (`getval` takes them out of autograd's boxes), then let "
+               "`squared_distances` say how far they are. Brute force counts as well as a tree."),
     Task("2.4", "losses.distance_maps", "Both distance maps, each on its own grid", 20, 15, map_cases,
          gradient=("predicted", "observed"), mistakes={
-             "The two maps are swapped": lambda *args, **case: distance_maps(*args, **case)[::-1],
-             "Pixels without depth cost: multiply each map by its own grid's mask": lambda predicted, observed,
-                 valid_predicted, valid_observed: (nearest_squared_distances(predicted, observed, valid_observed),
-                                                   nearest_squared_distances(observed, predicted, valid_predicted)),
-             "Pixels without depth attract: they must be nobody's neighbour": lambda predicted, observed,
-                 valid_predicted, valid_observed: tuple(
-                     each * mask for each, mask in zip(distance_maps(predicted, observed, valid_predicted | True,
-                                                                     valid_observed | True),
-                                                       (valid_predicted, valid_observed))),
-             "The two masks are swapped": lambda predicted, observed, valid_predicted, valid_observed:
-                 distance_maps(predicted, observed, valid_observed, valid_predicted)}),
+             "The two maps are swapped": lambda *args: distance_maps(*args)[::-1],
+             "Pixels without depth cost: multiply each map by its own grid's mask":
+                 lambda p, o, valid_p, valid_o: (nearest_squared_distances(p, o, valid_o),
+                                                 nearest_squared_distances(o, p, valid_p)),
+             "Pixels without depth attract: they must be nobody's neighbour":
+                 lambda p, o, valid_p, valid_o: tuple(each * valid for each, valid in zip(
+                     distance_maps(p, o, valid_p | True, valid_o | True), (valid_p, valid_o))),
+             "The two masks are swapped":
+                 lambda p, o, valid_p, valid_o: distance_maps(p, o, valid_o, valid_p)}),
     Task("2.5", "losses.chamfer_loss", "The sum of both maps, Eq. (2)", 10, 5, loss_cases,
          gradient=("map_predicted", "map_observed"), mistakes={
-             "Too small: did you sum both directions?": lambda map_predicted, map_observed:
-                 anp.sum(map_predicted, axis=1),
-             "The mean instead of the sum over the pixels": lambda map_predicted, map_observed:
-                 anp.mean(map_predicted + map_observed, axis=1),
-             "Summed over the interactions too: one number each": lambda map_predicted, map_observed:
-                 anp.sum(map_predicted + map_observed),
-             "No gradient to the second map": lambda map_predicted, map_observed:
-                 chamfer_loss(map_predicted, getval(map_observed))}),
+             "Too small: did you sum both directions?": lambda p, o: anp.sum(p, axis=1),
+             "The mean instead of the sum over the pixels": lambda p, o: anp.mean(p + o, axis=1),
+             "Summed over the interactions too: one number each": lambda p, o: anp.sum(p + o),
+             "No gradient to the second map": lambda p, o: chamfer_loss(p, getval(o))}),
     Task("2.6", "losses.seen_in_both", "Which points have a counterpart in the other frame", 10, 15, seen_cases,
          mistakes={
-             "Covered and uncovered table swapped": lambda valid, next_valid, occupied, next_occupied:
-                 (valid & (next_occupied | ~occupied), next_valid & (occupied | ~next_occupied)),
-             "Objects that moved are left out: only table has no counterpart": lambda valid, next_valid, occupied,
-                 next_occupied: (valid & ~(occupied ^ next_occupied), next_valid & ~(occupied ^ next_occupied)),
-             "Pixels without depth count": lambda valid, next_valid, occupied, next_occupied:
-                 seen_in_both(valid | True, next_valid | True, occupied, next_occupied)}),
+             "Covered and uncovered table swapped":
+                 lambda a, b, here, there: (a & (there | ~here), b & (here | ~there)),
+             "Objects that moved are left out: only table has no counterpart":
+                 lambda a, b, here, there: (a & ~(here ^ there), b & ~(here ^ there)),
+             "Pixels without depth count":
+                 lambda a, b, here, there: seen_in_both(a | True, b | True, here, there)}),
 )
 TESTS = ("eq2_chamfer",)

@@ -1,7 +1,7 @@
 """Warping and the photometric loss
 
-If the optical flow (U, V) of frame t is right, every pixel of I_t is found again in I_{t+1}, U pixels to the right and V
-pixels down of where it was:
+If the optical flow (U, V) of frame t is right, every pixel of I_t is found again in I_{t+1}, U pixels to the right and
+V pixels down of where it was:
 
     I'_t(x, y) = I_{t+1}(x + U, y + V)                      backward warping
     L_rec = sum_xy |I_t - I'_t|_1                           Eq. (3)
@@ -70,11 +70,22 @@ def changed(change):
     return maker
 
 
+def inside(images, positions):
+    return np.all((positions >= 0) & (positions <= np.array(images.shape[2:0:-1]) - 1), axis=-1)
+
+
 def beyond_border(right, g, images, positions):
-    """Slopes of the border go on outside of the picture, as when only the sampling is clipped."""
-    height, width = images.shape[1:3]
-    inside = np.clip(positions, 0.125, np.array([width, height]) - 1.125).astype(positions.dtype)
-    return _bilinear_position_vjp(None, images, inside)(g)
+    """The slope in the last cell goes on outside, as when only the sampling is clipped."""
+    last = np.array(images.shape[2:0:-1]) - 1.125
+    return _bilinear_position_vjp(None, images, np.clip(positions, 0.125, last).astype(positions.dtype))(g)
+
+
+def at_edge(right, g, images, positions):
+    """The slope along x for y rounded down, and the other way round."""
+    def slope(axis):
+        where = np.where(np.arange(2) == axis, positions, np.floor(positions)).astype(positions.dtype)
+        return _bilinear_position_vjp(None, images, where)(g)[..., axis]
+    return np.stack([slope(0), slope(1)], axis=-1)
 
 
 # --- warping, and the loss ---
@@ -86,86 +97,69 @@ def warp_cases(rng):
     return [by_hand, drawn[0], single(drawn[1])]
 
 
-def without_grid(next_images, flow):
-    return bilinear_sample(next_images, flow), warp_backward(next_images, flow)[1]
-
-
 def loss_cases(rng):
-    cases = warp_cases(rng)
-    for case in cases:
+    cases = []
+    for case in warp_cases(rng):
         shape = case["next_images"].shape
-        case["images"] = rng.random(shape).astype(case["flow"].dtype)
-        case["valid"] = rng.random((shape[0], shape[1] * shape[2])) < 0.8
+        cases.append({"images": rng.random(shape).astype(case["flow"].dtype), **case,
+                      "valid": rng.random((shape[0], shape[1] * shape[2])) < 0.8})
     cases[0].update(images=np.full((1, 2, 4, 1), 3.0), valid=np.arange(8).reshape(1, 8) > 0)
     return cases
 
 
-def loss_with(distance):
-    """Eq. (3) with another distance of warped and true picture: (difference, counts (B, H, W, 1)) -> (B,)."""
+def loss_with(distance, in_view_only=True):
+    """Eq. (3) with something else than |.|, or over more pixels."""
     def loss(images, next_images, flow, valid):
         warped, in_view = warp_backward(next_images, flow)
-        return distance(images - warped, (np.reshape(valid, in_view.shape) & in_view)[..., None])
+        counts = np.reshape(valid, in_view.shape) & (in_view | (not in_view_only))
+        return anp.sum(distance(images - warped) * counts[..., None], axis=(1, 2, 3))
     return loss
-
-
-def out_of_view_costs(images, next_images, flow, valid):
-    warped, in_view = warp_backward(next_images, flow)
-    return anp.sum(anp.abs(images - warped) * np.reshape(valid, in_view.shape)[..., None], axis=(1, 2, 3))
 
 
 TASKS = (
     Task("3.1", "ops.bilinear_sample", "Image values between pixels", 25, 30, sample_cases, mistakes={
-        "The nearest pixel instead of the mean of four": lambda images, positions:
-            bilinear_sample(images, np.floor(positions + 0.5)),
-        "The pixel above and to the left instead of the mean of four": lambda images, positions:
-            bilinear_sample(images, np.floor(positions)),
-        "x and y swapped: positions are (x right, y down), pictures [row, column]": lambda images, positions:
-            bilinear_sample(images, positions[..., ::-1]),
-        "The weights swapped: the pixel that is nearer counts more": lambda images, positions: bilinear_sample(
-            images, np.where(positions == np.clip(positions, 0, np.array(images.shape[2:0:-1]) - 1),
-                             2 * np.floor(positions) + 1 - positions, positions).astype(positions.dtype)),
-        "0 outside of the picture instead of its nearest pixel": lambda images, positions: bilinear_sample(
-            images, positions) * np.all(positions == np.clip(positions, 0, np.array(images.shape[2:0:-1]) - 1),
-                                        axis=-1, keepdims=True)},
-         notes="An autograd primitive: it sees plain arrays, and so its body is NumPy or OpenCV. Positions lie at "
-               "multiples of 1/8 px, so that what OpenCV rounds does not matter; `cv2.BORDER_REPLICATE` is its border."),
-    Task("3.2", "ops._bilinear_position_vjp", "Its VJP with respect to the positions, by hand", 30, 45, pull_cases, pull,
-         mistakes={
+        "The nearest pixel instead of the mean of four":
+            lambda images, positions: bilinear_sample(images, np.floor(positions + 0.5)),
+        "The pixel above and to the left instead of the mean of four":
+            lambda images, positions: bilinear_sample(images, np.floor(positions)),
+        "x and y swapped: positions are (x right, y down), pictures [row, column]":
+            lambda images, positions: bilinear_sample(images, positions[..., ::-1]),
+        "0 outside of the picture instead of its nearest pixel":
+            lambda images, positions: bilinear_sample(images, positions) * inside(images, positions)[..., None]},
+         notes="An autograd primitive: it sees plain arrays, so its body is NumPy or OpenCV. Positions lie at "
+               "multiples of 1/8 px: what OpenCV rounds does not matter."),
+    Task("3.2", "ops._bilinear_position_vjp", "The VJP of bilinear_sample for the positions, by hand", 30, 45,
+         pull_cases, pull, mistakes={
              "x and y swapped": changed(lambda right, g, *_: right(g)[..., ::-1]),
              "g is missing: each channel's slope times its g, summed": changed(lambda right, g, *_: right(0 * g + 1)),
              "The slope goes on outside of the picture: there it is 0": changed(beyond_border),
-             "The slope at the upper left pixel: interpolate along the other axis": changed(
-                 lambda right, g, images, positions: np.stack([_bilinear_position_vjp(None, images, np.where(
-                     [[axis == 0, axis == 1]], positions, np.floor(positions)).astype(positions.dtype))(g)[..., axis]
-                     for axis in (0, 1)], axis=-1)),
-             "Minus the slope: the right column minus the left one, the lower row minus the upper one": changed(
-                 lambda right, g, *_: -right(g)),
-             "The mean over the channels instead of their sum": changed(
-                 lambda right, g, images, positions: right(g) / images.dtype.type(max(images.shape[3], 2)))},
-         notes="ans are the sampled values (B, h, w, C). It returns a function vjp(g), g of the shape of ans, that "
-               "returns the gradient with respect to the positions, in their shape and dtype."),
+             "The slope along the upper or left edge of the cell: interpolate along the other axis": changed(at_edge),
+             "Minus the slope: the right column minus the left one, the lower row minus the upper one":
+                 changed(lambda right, g, *_: -right(g))},
+         notes="ans are the sampled values (B, h, w, C). It returns a function vjp(g), g in the shape of ans, that "
+               "returns the gradient with respect to the positions, in their shape and dtype. Per position: the sum "
+               "over the channels of g times the slope."),
     Task("3.3", "losses.warp_backward", "Frame t+1 pulled back along the flow", 20, 20, warp_cases, gradient=("flow",),
          mistakes={
-             "Minus the flow": lambda next_images, flow: warp_backward(next_images, -flow),
-             "x and y swapped": lambda next_images, flow: warp_backward(next_images, flow[..., ::-1]),
-             "The flow taken for a position: add each pixel's own": without_grid,
-             "Everything is in view": lambda next_images, flow:
-                 (warp_backward(next_images, flow)[0], np.ones(flow.shape[:3], bool)),
-             "Half a pixel off: pixel centres are whole numbers": lambda next_images, flow:
-                 warp_backward(next_images, flow + flow.dtype.type(0.5))},
-         notes="in_view is a plain bool array: `getval` takes the positions out of autograd's box. Within 0.001 px of "
-               "the border is in view."),
-    Task("3.4", "losses.photometric_loss", "Eq. (3)", 25, 15, loss_cases, gradient=("flow", "images"), mistakes={
-        "Squared: Eq. (3) has the absolute value": loss_with(
-            lambda away, counts: anp.sum(away ** 2 * counts, axis=(1, 2, 3))),
-        "The mean instead of the sum": loss_with(
-            lambda away, counts: anp.sum(anp.abs(away) * counts, axis=(1, 2, 3)) / float(np.prod(away.shape[1:]))),
-        "The sign is kept: where is |.|?": loss_with(lambda away, counts: anp.sum(away * counts, axis=(1, 2, 3))),
-        "Pixels that leave the view cost": out_of_view_costs,
-        "Pixels that are not valid cost": lambda images, next_images, flow, valid:
-            photometric_loss(images, next_images, flow, valid | True),
-        "Minus the flow": lambda images, next_images, flow, valid: photometric_loss(images, next_images, -flow, valid),
-        "The two frames are swapped: frame t+1 is pulled back": lambda images, next_images, flow, valid:
-            photometric_loss(next_images, images, flow, valid)}),
+             "Minus the flow": lambda image, flow: warp_backward(image, -flow),
+             "x and y swapped": lambda image, flow: warp_backward(image, flow[..., ::-1]),
+             "The flow taken for a position: add each pixel's own":
+                 lambda image, flow: (bilinear_sample(image, flow), warp_backward(image, flow)[1]),
+             "Everything is in view":
+                 lambda image, flow: (warp_backward(image, flow)[0], np.ones(flow.shape[:3], bool)),
+             "Half a pixel off: pixel centres are whole numbers":
+                 lambda image, flow: warp_backward(image, flow + flow.dtype.type(0.5))},
+         notes="in_view is a plain bool array: `getval` takes the positions out of autograd's box. The border itself "
+               "is in view, and so is what lies 0.001 px beyond it, for rounding."),
+    Task("3.4", "losses.photometric_loss", "Eq. (3)", 25, 15, loss_cases, gradient=("images", "flow"), mistakes={
+        "Squared: Eq. (3) has the absolute value": loss_with(lambda away: away ** 2),
+        "The sign is kept: where is |.|?": loss_with(lambda away: away),
+        "The mean instead of the sum":
+            lambda a, b, flow, valid: photometric_loss(a, b, flow, valid) / float(np.prod(a.shape[1:])),
+        "Pixels that leave the view cost": loss_with(anp.abs, in_view_only=False),
+        "Pixels that are not valid cost": lambda a, b, flow, valid: photometric_loss(a, b, flow, valid | True),
+        "Minus the flow": lambda a, b, flow, valid: photometric_loss(a, b, -flow, valid),
+        "The two frames are swapped: frame t+1 is pulled back":
+            lambda a, b, flow, valid: photometric_loss(b, a, flow, valid)}),
 )
 TESTS = ("eq3_photometric",)

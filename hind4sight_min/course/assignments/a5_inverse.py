@@ -7,10 +7,10 @@ arena's grid: where the finger came down, and where it went. It is trained with 
     L_act = -log softmax(z_start)[cell of the start] - log softmax(z_end)[cell of the end]
     L_sim = mean |s'_{t+1} - s_{t+1}|
 
-exp overflows for large logits; subtracting the largest of them changes nothing else. s_t is the state embedding, the sum
-of the encoder's features over the points of objects: s'_{t+1} that of the predicted cloud, s_{t+1} that of the observed
-one. L_sim moves the points. Where it measures, its gradient must stop: free to, the encoder would make L_sim small by
-saying nothing at all.
+exp overflows for large logits; subtracting the largest of them changes nothing else. s_t is the state embedding, the
+sum of the encoder's features over the points of objects (times STATE_GAIN): s'_{t+1} that of the predicted cloud,
+s_{t+1} that of the observed one. L_sim moves the points. Where it measures, its gradient must stop: free to, the
+encoder would make L_sim small by saying nothing at all.
 
 **Cells** are counted row by row; rows run along y, columns along x; cell 0 is at the corner (-arena/2, -arena/2).
 
@@ -27,7 +27,7 @@ from autograd.tracer import getval
 from ...interactions import cell_centres, cells_of
 from ...lab.evaluation import poke_from_heatmaps
 from ...losses import embedding_loss, heatmap_cross_entropy
-from ...networks import STATE_GAIN, Sizes, encode, init_parameters, softmax, state_embedding
+from ...networks import STATE_GAIN, encode, softmax, state_embedding
 from ..task import Task, single
 
 
@@ -72,7 +72,8 @@ def picked(values, cells):
 
 
 def embedding_cases(rng):
-    by_hand = {"predicted": np.array([[1.0, 2, 3, 0], [0, 0, 0, 8]]), "observed": np.array([[2.0, 0, 3, 1], [1, 2, 3, 4]])}
+    by_hand = {"predicted": np.array([[1.0, 2, 3, 0], [0, 0, 0, 8]]),
+               "observed": np.array([[2.0, 0, 3, 1], [1, 2, 3, 4]])}
     drawn = [{"predicted": rng.normal(size=(3, 5)), "observed": rng.normal(size=(3, 5))} for _ in range(2)]
     return [by_hand, drawn[0], single(drawn[1])]
 
@@ -88,10 +89,15 @@ def state_cases(rng):
     return [fixed, drawn((2, 6)), single(drawn((2, 6)))]
 
 
+LAYERS = {"encoder_1_w": np.random.default_rng(0).normal(size=(20, 4)) / 4, "encoder_1_b": np.zeros(4),
+          "encoder_2_b": np.zeros(4)}
+
+
 def embedded(function, points, weights, occupied):
     """With an encoder of four features, the same at every call but for the weights of its second layer."""
-    params = init_parameters(Sizes(embedding=4), np.random.default_rng(0), getval(points).dtype)
-    return function({**params, "encoder_2_w": weights}, points, occupied)
+    dtype = getval(points).dtype
+    return function({**{name: value.astype(dtype) for name, value in LAYERS.items()}, "encoder_2_w": weights}, points,
+                    occupied)
 
 
 def summed(params, points, weights):
@@ -140,70 +146,62 @@ TASKS = (
     Task("5.1", "networks.softmax", "Probabilities from logits, safe for large ones", 10, 10, logit_cases,
          gradient=("logits",), mistakes={
              "exp overflows: subtract the largest logit first": naive,
-             "Over all numbers instead of the last axis": lambda logits: softmax(
-                 logits.reshape(1, -1)).reshape(logits.shape),
-             "Over the first axis instead of the last": lambda logits: anp.swapaxes(softmax(anp.swapaxes(
-                 logits, 0, -1)), 0, -1),
-             "The logarithm of it": lambda logits: anp.log(softmax(logits)),
-             "Not divided by the sum": lambda logits: anp.exp(logits - np.max(getval(logits), axis=-1, keepdims=True))}),
+             "Over all numbers instead of the last axis": lambda z: softmax(z.reshape(1, -1)).reshape(z.shape),
+             "Over the first axis instead of the last": lambda z: anp.swapaxes(softmax(anp.swapaxes(z, 0, -1)), 0, -1),
+             "The logarithm of it": lambda z: anp.log(softmax(z)),
+             "Not divided by the sum": lambda z: anp.exp(z - np.max(getval(z), axis=-1, keepdims=True))}),
     Task("5.2", "interactions.cells_of", "Which cell of the grid a place is in", 15, 15, place_cases, grid, mistakes={
         "Rows and columns swapped: rows run along y": lambda xy, settings: cells_by(np.floor, xy, settings, swap=True),
         "Rounded to the nearest instead of down": lambda xy, settings: cells_by(np.round, xy, settings),
-        "Places outside of the arena belong to the cells of its rim": lambda xy, settings: cells_by(
-            np.floor, xy, settings, clip=False),
-        "The arena's origin is in its middle, not in its corner": lambda xy, settings: cells_of(
-            xy - settings["arena"] / 2, settings)},
-         notes="The drawn places have more axes than one in front."),
+        "Places outside of the arena belong to the cells of its rim":
+            lambda xy, settings: cells_by(np.floor, xy, settings, clip=False),
+        "The arena's origin is in its middle, not in its corner":
+            lambda xy, settings: cells_of(xy - settings["arena"] / 2, settings)},
+         notes="settings is a dict with \"arena\", its side, and \"cell\", a cell's, in m. Only the last axis of xy is "
+               "sure: it may be (2,), (4, 2), (3, 5, 2)."),
     Task("5.3", "losses.heatmap_cross_entropy", "L_act of one heat-map", 20, 20, entropy_cases, gradient=("logits",),
          mistakes={
-             "The sign: it is minus the logarithm": lambda logits, cells: -heatmap_cross_entropy(logits, cells),
-             "exp overflows: subtract the largest logit first": lambda logits, cells:
-                 -anp.log(picked(naive(logits), cells)),
-             "The logarithm is missing": lambda logits, cells: 1 - picked(softmax(logits), cells),
-             "The softmax is missing": lambda logits, cells: -picked(logits, cells),
-             "Cells are counted from 0": lambda logits, cells: heatmap_cross_entropy(logits, cells - 1),
-             "The mean over the interactions: one number each": lambda logits, cells: anp.mean(
-                 heatmap_cross_entropy(logits, cells))}),
+             "The sign: it is minus the logarithm": lambda z, cells: -heatmap_cross_entropy(z, cells),
+             "exp overflows: subtract the largest logit first": lambda z, cells: -anp.log(picked(naive(z), cells)),
+             "The logarithm is missing": lambda z, cells: picked(softmax(z), cells),
+             "The softmax is missing": lambda z, cells: -picked(z, cells),
+             "Cells are counted from 0": lambda z, cells: heatmap_cross_entropy(z, cells - 1),
+             "The mean over the interactions: one number each":
+                 lambda z, cells: anp.mean(heatmap_cross_entropy(z, cells))}),
     Task("5.4", "losses.embedding_loss", "L_sim", 10, 5, embedding_cases, gradient=("predicted", "observed"), mistakes={
-        "The sum over the embedding instead of its mean": lambda predicted, observed: anp.sum(
-            anp.abs(predicted - observed), axis=1),
-        "Squared: L_sim has the absolute value": lambda predicted, observed: anp.mean((predicted - observed) ** 2, axis=1),
-        "The sign is kept: where is |.|?": lambda predicted, observed: anp.mean(predicted - observed, axis=1),
-        "The length of the difference (L2)": lambda predicted, observed: anp.sqrt(anp.sum(
-            (predicted - observed) ** 2, axis=1)),
-        "No gradient to the observed state's embedding": lambda predicted, observed: embedding_loss(
-            predicted, getval(observed))}),
-    Task("5.5", "networks.state_embedding", "The sum of features over the points of objects", 20, 25, state_cases, embedded,
-         gradient=("points", "weights"), mistakes={
-             "The gradient must stop at the encoder's weights": lambda params, points, occupied: summed(
-                 params, points, occupied.astype(points.dtype)),
-             "The gradient must go on to the points": lambda params, points, occupied: state_embedding(
-                 params, getval(points), occupied),
-             "All points count: only those of objects do": lambda params, points, occupied: state_embedding(
-                 params, points, occupied | True),
-             "STATE_GAIN is missing": lambda params, points, occupied: state_embedding(
-                 params, points, occupied) / STATE_GAIN,
+        "The sum over the embedding instead of its mean": lambda p, o: anp.sum(anp.abs(p - o), axis=1),
+        "Squared: L_sim has the absolute value": lambda p, o: anp.mean((p - o) ** 2, axis=1),
+        "The sign is kept: where is |.|?": lambda p, o: anp.mean(p - o, axis=1),
+        "The length of the difference (L2)": lambda p, o: anp.sqrt(anp.sum((p - o) ** 2, axis=1)),
+        "No gradient to the observed state's embedding": lambda p, o: embedding_loss(p, getval(o))},
+         notes="autograd's derivative of anp.mean turns float32 into float64; divide anp.sum by a float."),
+    Task("5.5", "networks.state_embedding", "The sum of features over the points of objects", 20, 25, state_cases,
+         embedded, gradient=("points", "weights"), mistakes={
+             "The gradient must stop at the encoder's weights":
+                 lambda params, points, occupied: summed(params, points, occupied.astype(points.dtype)),
+             "The gradient must go on to the points":
+                 lambda params, points, occupied: state_embedding(params, getval(points), occupied),
+             "All points count: only those of objects do":
+                 lambda params, points, occupied: state_embedding(params, points, occupied | True),
+             "STATE_GAIN is missing":
+                 lambda params, points, occupied: state_embedding(params, points, occupied) / STATE_GAIN,
              "The mean over the points instead of the sum": lambda params, points, occupied: summed(
                  held(params), points, occupied / occupied.sum(axis=1, keepdims=True).astype(points.dtype))},
-         notes="`encode(params, points)` gives the features; `getval` of a parameter is its plain array. `weights` here "
-               "is the parameter \"encoder_2_w\", whose gradient must be 0."),
+         notes="`encode(params, points)` gives the features (B, N, E); `getval(parameter)` is the same array, of which "
+               "autograd knows nothing. `weights` here is the parameter \"encoder_2_w\", whose gradient must be 0; the "
+               "others are fixed, so this case is to be compared, not done by hand."),
     Task("5.6", "lab.evaluation.poke_from_heatmaps", "The poke that two heat-maps name", 25, 30, heatmap_cases, named,
          mistakes={
-             "The best cell's centre: the mean around it is finer": lambda start_heatmap, end_heatmap, settings: poke_to(
-                 cell_centres(settings)[end_heatmap.argmax()], start_heatmap, settings),
+             "The best cell's centre: the mean around it is finer":
+                 lambda start, end, settings: poke_to(cell_centres(settings)[end.argmax()], start, settings),
              "The mean of all of the end map: cells further than PEAK from the best one do not count":
-                 lambda start_heatmap, end_heatmap, settings: poke_to(
-                     end_heatmap @ cell_centres(settings), start_heatmap, settings),
-             "Not divided by the sum of the cells that count": lambda start_heatmap, end_heatmap, settings: poke_to(
-                 poke_from_heatmaps(start_heatmap, end_heatmap, settings)[:2] * (end_heatmap * (np.linalg.norm(
-                     cell_centres(settings) - cell_centres(settings)[end_heatmap.argmax()], axis=1) < 0.08)).sum(),
-                 start_heatmap, settings),
-             "The direction is opposite: from the start to the target": turned(
-                 lambda poke, start, centres: (poke[2] + 2 * np.pi) % (2 * np.pi) - np.pi),
-             "arctan2 takes y first": turned(lambda poke, start, centres: np.pi / 2 - poke[2]),
-             "The direction from the best start cell alone, not the start map's mean": turned(
-                 lambda poke, start, centres: np.arctan2(*(poke[:2] - centres[start.argmax()])[::-1])),
-             "The direction from the start map's mean place: each cell's unit vector counts": turned(
-                 lambda poke, start, centres: np.arctan2(*(poke[:2] - start @ centres)[::-1]))}),
+                 lambda start, end, settings: poke_to(end @ cell_centres(settings), start, settings),
+             "The direction is opposite: it is that from the start to the target":
+                 turned(lambda poke, start, centres: poke[2] - np.sign(poke[2]) * np.pi),
+             "arctan2 takes y first": turned(lambda poke, start, centres: np.arctan2(np.cos(poke[2]), np.sin(poke[2]))),
+             "The direction from the best start cell alone, not the start map's mean":
+                 turned(lambda poke, start, centres: np.arctan2(*(poke[:2] - centres[start.argmax()])[::-1])),
+             "The direction from the start map's mean place: each cell's unit vector counts":
+                 turned(lambda poke, start, centres: np.arctan2(*(poke[:2] - start @ centres)[::-1]))}),
 )
 TESTS = ("inverse_loss",)

@@ -5,13 +5,13 @@ draws J candidates from a Gaussian, keeps the K cheapest (the *elites*), fits th
 
     mean = mean of the elites,   deviation = root of their mean squared distance from it,   for each number of a poke
 
-A poke is (a_x, a_y, a_theta). Directions are circular: -3.1 and 3.1 rad are 0.08 rad apart, their mean is pi and not 0,
-arctan2(mean sin, mean cos). A deviation below LEAST would only draw the same pokes again. Candidates that cannot be have
-infinite or NaN cost: these lose, and are never elites. The best candidate *ever seen* is the answer.
+A poke is (a_x, a_y, a_theta). Directions are circular: -3.1 and 3.1 rad are 0.08 rad apart, and their mean is pi, not
+0: arctan2(mean sin, mean cos). A deviation below LEAST would only draw the same pokes again. Candidates that cannot be
+have infinite or NaN cost: these lose, and are never elites. The best candidate *ever seen* is the answer.
 
-**Where the finger comes down.** Training pokes began in free cells 10 to 14 cm *behind* an occupied target, and the model
-knows no others: a candidate is possible if its target is inside the walls and in or next to a cell with an object, and
-on some such path the finger fits.
+**Where the finger comes down.** Training pokes began in free cells 10 to 14 cm *behind* an occupied target, and the
+model knows no others: a candidate is possible if its target is inside the walls and in or next to a cell with an
+object, and on some such path the finger fits.
 
 **The cost** of a scene, Sec. IV-G: how far the marked points' pixels are from where they shall be, and how far the
 objects are from the goal picture's, both in cm on the table, so that neither drowns the other:
@@ -24,10 +24,12 @@ Paper: Sec. III-H and IV-G; lesson 10_planning.
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from ...geometry import Camera
+from ...geometry import Camera, project
 from ...interactions import cells_of, finger_fits, with_neighbours
-from ...planning import Goal, NoPoke, Search, View, cem, first_start, planning_cost, possible_starts, refit, wrapped
+from ...planning import (LEAST, SLACK, Goal, Search, View, cem, first_start, planning_cost, possible_starts, refit,
+                         wrapped)
 from ...scene import Scene
 from ..task import Task, single
 from .a1_camera import DOWN
@@ -43,23 +45,24 @@ def elite_cases(rng):
     return [by_hand, {"elites": rng.normal(size=(5, 2, 3)) * [0.1, 0.001, 0.4] + [0.1, 0, np.pi - 0.3]}]
 
 
-def refitted(change):
-    return lambda elites: change(elites, *refit(elites))
+def deviation_from(mean, elites):
+    return np.sqrt(((elites - mean) ** 2).mean(axis=0))
 
 
 # --- starts ---
 
 def start_cases(rng):
-    block = np.zeros((1, 5, 5), int)
-    block[0, 2, 2] = 1
-    by_hand = {"pokes": np.array([[0.0, 0, 0], [0.0, 0, np.pi / 2], [0.2, 0.2, 0]]), "grid": np.repeat(block, 3, axis=0),
-               "arena": 0.5, "cell": 0.1, "lengths": 2}
-    pokes = rng.uniform(-1, 1, (40, 3)) * [0.26, 0.26, np.pi]
-    grid = np.zeros((40, 20, 20), int)
-    rows, columns = rng.integers(20, size=(2, 40, 5))
-    grid[np.arange(40)[:, None], rows, columns] = 1
+    block = np.zeros((3, 6, 6), int)
+    block[:, 3, 4] = 1  # pokes: along x; from the wall; on nothing
+    by_hand = {"pokes": np.array([[0.07, 0.01, 0], [0.07, 0.01, np.pi], [-0.1, -0.1, 0]]), "grid": block,
+               "arena": 0.3, "cell": 0.05, "lengths": 2}
+    pokes = rng.uniform(-1, 1, (40, 3)) * [0.2, 0.2, np.pi]
+    pokes[:5, 0], pokes[:5, 2] = 0.26, 0  # outside of the wall, pushed from inside
     beside = pokes[:, :2] + [0.025, 0] * (np.arange(40) % 2)[:, None]  # half of the targets are on, half next to it
-    grid.reshape(40, -1)[np.arange(40), cells_of(beside, {"arena": 0.5, "cell": 0.025})] = 1
+    grid = np.zeros((40, 20, 20), int)
+    grid.reshape(40, -1)[np.arange(30), cells_of(beside, {"arena": 0.5, "cell": 0.025})[:30]] = 1  # the last: no object
+    for block in grid[5:]:
+        block[rng.integers(20, size=9), rng.integers(20, size=9)] = 1
     return [by_hand, {"pokes": pokes, "grid": grid, "arena": 0.5, "cell": 0.025, "lengths": 5}]
 
 
@@ -88,11 +91,6 @@ def outside_too(pokes, grid, settings, lengths):
     return np.where(near[:, None, None], where_it_fits(pokes, grid, settings, lengths), np.nan)
 
 
-def mirrored(pokes):
-    """sin for cos."""
-    return np.concatenate([pokes[:, :2], np.pi / 2 - pokes[:, 2:]], axis=1)
-
-
 def nearly_cases(rng):
     by_hand = {"starts": np.array([[[1.0, 2], [3, 4]], [[np.nan, np.nan], [5, 6]]])}
     drawn = rng.normal(size=(2, 6, 5, 2))
@@ -108,15 +106,16 @@ CAMERA = Camera(64, 48, 60.0, 70.0, 31.0, 22.0, DOWN)
 
 
 def cost_cases(rng):
-    by_hand = {"clouds": np.array([[[0.2, 0.1, 0], [0.3, 0.1, 0], [0, 0, 0]], [[0.2, 0.2, 0], [0.3, 0.2, 0], [0, 0, 0]]]),
-               "cloud": np.zeros((3, 3)), "occupied": np.array([True, True, False]), "marked": 1,
+    clouds = np.array([[[0.0, 0, 0], [0.2, 0.1, 0], [0.3, 0.1, 0]], [[0, 0, 0], [0.2, 0.2, 0], [0.3, 0.2, 0]]])
+    by_hand = {"clouds": clouds, "cloud": np.zeros((3, 3)), "occupied": np.array([False, True, True]), "marked": 1,
                "goal_pixels": np.array([[31.0, 22]]), "goal_points": np.array([[0.2, 0.1, 0], [0.2, 0.2, 0]]),
                "pixel_weight": 1.0, "chamfer_weight": 1.0}
     drawn = []
     for weights in ((1.0, 0.5), (0.0, 2.0)):
         clouds = rng.uniform(-0.2, 0.2, (4, 12, 3))
+        near = project(clouds[0, -3:], CAMERA) + [[0.2, 0.1], [3, 4], [-6, 1]]  # the first mark is within SLACK
         drawn.append({"clouds": clouds, "cloud": clouds[0].copy(), "occupied": np.arange(12) > 4, "marked": 3,
-                      "goal_pixels": rng.uniform(15, 35, (3, 2)), "goal_points": rng.uniform(-0.2, 0.2, (5, 3)),
+                      "goal_pixels": near, "goal_points": rng.uniform(-0.2, 0.2, (5, 3)),
                       "pixel_weight": weights[0], "chamfer_weight": weights[1]})
     return [by_hand, *drawn]
 
@@ -128,21 +127,15 @@ def cost_of(function, clouds, cloud, occupied, marked, goal_pixels, goal_points,
 
 
 def cost_with(pixels=None, chamfer=None):
-    """The cost with another first term, distances (J, M) m -> (J,), or another second one, (there, back) m -> float."""
+    """The cost with another first term, distances (J, M) m -> (J,), or second one, (there, back) m -> a number."""
     def function(clouds, view, goal, camera, search):
-        from scipy.spatial.distance import cdist
-
-        from ...geometry import project
-        cost = np.zeros(len(clouds))
-        if search.pixel_weight and pixels:
+        if pixels:
             away = np.linalg.norm(project(clouds[:, len(view.cloud) - view.marked:], camera) - goal.pixels, axis=2)
-            cost += search.pixel_weight * pixels(away, camera.pixel_size)
-        elif search.pixel_weight:
-            cost += planning_cost(clouds, view, goal, camera, replace(search, chamfer_weight=0.0))
-        if chamfer:
-            pairs = [cdist(each, goal.points) for each in clouds[:, view.occupied]]
-            return cost + search.chamfer_weight * np.array([chamfer(each.min(1), each.min(0)) for each in pairs])
-        return cost + planning_cost(clouds, view, goal, camera, replace(search, pixel_weight=0.0))
+            wrong = search.pixel_weight * pixels(away * camera.pixel_size)
+            return wrong + planning_cost(clouds, view, goal, camera, replace(search, pixel_weight=0.0))
+        pairs = [cdist(each, goal.points) for each in clouds[:, view.occupied]]
+        wrong = search.chamfer_weight * np.array([chamfer(each.min(axis=1), each.min(axis=0)) for each in pairs])
+        return wrong + search.pixel_weight * planning_cost(clouds, view, goal, camera, Search(chamfer_weight=0.0))
     return function
 
 
@@ -154,8 +147,12 @@ def table_too(clouds, view, goal, camera, search):
 # --- CEM ---
 
 def search_cases(rng):
-    return [{"population": np.float32(rng.uniform(-1, 1, (count, 2, 3)) * [0.2, 0.2, 3.1]), "seed": seed, "rounds": rounds,
-             "target": rng.uniform(-0.1, 0.1, (2, 3)) + [0, 0, 3.1]} for seed, count, rounds in ((0, 6, 2), (1, 12, 4), (2, 8, 3))]
+    fixed = np.random.default_rng(0)
+
+    def drawn(rng, count, rounds, horizon):
+        return {"population": np.float32(rng.uniform(-1, 1, (count, horizon, 3)) * [0.2, 0.2, 3.1]), "seed": count,
+                "rounds": rounds, "target": rng.uniform(-0.1, 0.1, (horizon, 3)) + [0, 0, 3.1]}
+    return [drawn(fixed, 5, 2, 1), drawn(rng, 12, 4, 2), drawn(rng, 8, 3, 2)]
 
 
 def searched(function, population, seed, rounds, target):
@@ -207,54 +204,56 @@ TASKS = (
     Task("6.1", "planning.wrapped", "Angles in [-pi, pi)", 5, 5, angle_cases, mistakes={
         "In [0, 2 pi)": lambda angle: angle % (2 * np.pi),
         "Cut off at pi instead of turned on": lambda angle: np.clip(angle, -np.pi, np.pi),
-        "Half a turn off": lambda angle: wrapped(angle + np.pi),
-        "In degrees": lambda angle: (angle + 180) % 360 - 180}),
+        "Half a turn off": lambda angle: wrapped(angle + np.pi)}),
     Task("6.2", "planning.refit", "The Gaussian of the elites; directions are circular", 20, 20, elite_cases, mistakes={
-        "Directions are circular: the mean of 3.1 and -3.1 is pi, not 0": lambda elites: (
-            elites.mean(axis=0), np.maximum(elites.std(axis=0), [0.002, 0.002, 0.03])),
-        "The deviation of the directions is circular too": refitted(lambda elites, mean, deviation: (mean, np.maximum(
-            np.sqrt(((elites - mean) ** 2).mean(axis=0)), [0.002, 0.002, 0.03]))),
-        "The variance, not its root": refitted(lambda elites, mean, deviation: (mean, deviation ** 2)),
-        "Divided by K - 1, not by K": refitted(lambda elites, mean, deviation: (mean, np.where(
-            deviation > [0.002, 0.002, 0.03], deviation * np.sqrt(len(elites) / (len(elites) - 1)), deviation))),
-        "At least LEAST: a narrower Gaussian draws the same pokes again": refitted(lambda elites, mean, deviation: (
-            mean, np.sqrt(np.where(np.arange(3) < 2, ((elites - mean) ** 2).mean(axis=0), deviation ** 2))))}),
+        "Directions are circular: the mean of 3.1 and -3.1 is pi, not 0":
+            lambda elites: (elites.mean(axis=0), np.maximum(elites.std(axis=0), LEAST)),
+        "The deviation of the directions is circular too":
+            lambda elites: (refit(elites)[0], np.maximum(deviation_from(refit(elites)[0], elites), LEAST)),
+        "The variance, not its root": lambda elites: (refit(elites)[0], np.maximum(refit(elites)[1] ** 2, LEAST)),
+        "Divided by K - 1, not by K": lambda elites: (
+            refit(elites)[0], refit(elites)[1] * np.sqrt(len(elites) / (len(elites) - 1))),
+        "At least LEAST: a narrower Gaussian draws the same pokes again": lambda elites: (
+            refit(elites)[0], np.where(np.arange(3) < 2, elites.std(axis=0), refit(elites)[1]))}),
     Task("6.3", "planning.possible_starts", "Where the finger may come down for each poke", 20, 30, start_cases, starts,
          mistakes={
-             "Ahead of the target: the finger comes from behind": lambda pokes, grid, settings, lengths: possible_starts(
-                 pokes + [0, 0, np.pi], grid, settings, lengths),
-             "sin and cos swapped": lambda pokes, grid, settings, lengths: possible_starts(
-                 mirrored(pokes), grid, settings, lengths),
+             "Ahead of the target: the finger comes from behind":
+                 lambda pokes, *others: possible_starts(pokes + [0, 0, np.pi], *others),
+             "sin and cos swapped":
+                 lambda pokes, *others: possible_starts(pokes * [1, 1, -1] + [0, 0, np.pi / 2], *others),
              "NaN where the finger does not fit": anywhere,
              "NaN where no object is near the target": where_it_fits,
              "The neighbours of an occupied cell are targets as well": on_cell_only,
              "Targets outside of the walls cannot be": outside_too,
              "The shortest path first": lambda pokes, grid, settings, lengths: possible_starts(
                  pokes, grid, {**settings, "poke_length": settings["poke_length"][::-1]}, lengths)},
-         notes="settings has \"arena\" and \"poke_length\", the shortest and the longest, in m; `with_neighbours`, "
-               "`cells_of` and `finger_fits` are at hand."),
+         notes="settings is a dict with \"arena\", its side, and \"poke_length\", the shortest and the longest, in m. "
+               "`help(with_neighbours)`, `help(cells_of)` and `help(finger_fits)` say what these do. The walls are at "
+               "half the arena's side; a path's lengths are evenly spaced, both ends included."),
     Task("6.4", "planning.first_start", "The first of several starts that is possible", 10, 10, nearly_cases, mistakes={
         "The first one, possible or not": lambda starts: starts[:, 0],
         "The last possible one": lambda starts: first_start(starts[:, ::-1]),
-        "0 where none is possible; NaN says so": lambda starts: np.nan_to_num(first_start(starts)),
-        "The mean of all that are possible": lambda starts: np.stack([
-            each[np.isfinite(each[:, 0])].mean(axis=0) if np.isfinite(each).any() else each[0] for each in starts])}),
-    Task("6.5", "planning.planning_cost", "Pixel distance and Chamfer distance to the goal", 20, 30, cost_cases, cost_of,
-         mistakes={
-             "SLACK is not taken off": cost_with(pixels=lambda away, size: 100 * (away * size).mean(axis=1)),
-             "The marks' distance in pixels, not in cm on the table": cost_with(
-                 pixels=lambda away, size: np.maximum(away - 0.015, 0).mean(axis=1)),
-             "SLACK is taken off the mean, not off each mark's distance": cost_with(
-                 pixels=lambda away, size: 100 * np.maximum((away * size).mean(axis=1) - 0.0751, 0)),
+        "0 where none is possible; NaN says so": lambda starts: np.nan_to_num(first_start(starts))},
+         notes="A start that is not possible is NaN in both coordinates."),
+    Task("6.5", "planning.planning_cost", "Pixel distance and Chamfer distance to the goal", 20, 30, cost_cases,
+         cost_of, mistakes={
+             "SLACK is not taken off": cost_with(pixels=lambda away: 100 * away.mean(axis=1)),
+             "SLACK is taken off the mean, not off each mark's distance":
+                 cost_with(pixels=lambda away: 100 * np.maximum(away.mean(axis=1) - SLACK, 0)),
+             "In m, not in cm": lambda *args: planning_cost(*args) / 100,
              "Chamfer one way only": cost_with(chamfer=lambda there, back: 100 * np.sqrt(np.mean(there ** 2))),
-             "The root is missing": cost_with(chamfer=lambda there, back: 100 * (np.mean(there ** 2) + np.mean(back ** 2))),
-             "Sums over the points instead of means": cost_with(
-                 chamfer=lambda there, back: 100 * np.sqrt(np.sum(there ** 2) + np.sum(back ** 2))),
-             "The mean distance instead of the root of the mean squared one": cost_with(
-                 chamfer=lambda there, back: 100 * (np.mean(there) + np.mean(back))),
+             "The root is missing":
+                 cost_with(chamfer=lambda there, back: 100 * (np.mean(there ** 2) + np.mean(back ** 2))),
+             "Sums over the points instead of means":
+                 cost_with(chamfer=lambda there, back: 100 * np.sqrt(np.sum(there ** 2) + np.sum(back ** 2))),
+             "The mean distance instead of the root of the mean squared one":
+                 cost_with(chamfer=lambda there, back: 100 * (np.mean(there) + np.mean(back))),
              "The table counts: only the points of objects do": table_too},
-         notes="The marked points are the last `view.marked` of a cloud; they are of objects too. Without the one weight "
-               "or the other its term is left out. `camera.pixel_size` is in m."),
+         notes="view, goal and search are a View, a Goal and a Search of `hind4sight_min.planning`: `help` says what "
+               "they hold. The marked points are the last `view.marked` of a cloud; they are points of objects too. "
+               "`project(points, camera)` gives their pixels and `camera.pixel_size` a pixel's size in m. A weight of "
+               "0 leaves its term out; Chamfer without goal points is a ValueError. The case: camera 2 m above the "
+               "table."),
     Task("6.6", "planning.cem", "The cross entropy method", 25, 40, search_cases, searched, mistakes={
         "The most expensive are the elites": other_cem(sign=-1),
         "The best of the last round; the best ever seen is the answer": other_cem(ever=False),
@@ -262,9 +261,11 @@ TASKS = (
         "Candidates of infinite cost are among the elites": other_cem(finite=False),
         "Directions leave [-pi, pi)": other_cem(wrap=False),
         "NaN wins; it has to lose": nan_wins},
-         notes="So that the numbers can be compared, draw once a round: rng.standard_normal(population.shape), in the last "
-               "round too; the next population is float32, its directions in [-pi, pi), and its row 0 the best so far. "
-               "`refit` makes the Gaussian. The case: the best sequence, its cost, the populations, and of every round "
-               "mean and deviation."),
+         notes="search is a Search of `hind4sight_min.planning`: its elites and iterations count here, iteration is 0 "
+               "at first, and J is as many as `population` holds. If all candidates cannot be, raise NoPoke; if some "
+               "elites cannot, the others make the Gaussian, or the best so far alone. So that the numbers can be "
+               "compared, draw the next population with one rng.standard_normal(population.shape), as float32; its "
+               "directions are in [-pi, pi) and its row 0 is the best so far. The case says what came of it: the best "
+               "sequence and its cost, the population of each round, and each round's mean and deviation."),
 )
 TESTS = ()

@@ -14,7 +14,7 @@ number lies if the code is right. Good numbers to know are
 - a derivative beside central differences;
 - an invariant: what must not depend on something does not.
 
-A range wide enough for rounding and narrow enough for the bug: in float64 an identity holds to 1e-12, in float32 to 1e-5.
-Use inputs where nothing vanishes or is symmetric by chance.
+A range wide enough for rounding and narrow enough for the bug: in float64 an identity holds to 1e-12, in float32 to
+1e-5. Use inputs where nothing vanishes or is symmetric by chance.
 """
 from ..bugs import files  # noqa: F401
