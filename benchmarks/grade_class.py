@@ -1,16 +1,16 @@
 """A class of 30 submissions, a third of them broken or hostile, graded by one command that is killed halfway.
 
     python benchmarks/grade_class.py --json class.json
+    python benchmarks/grade_class.py --attacks --without-namespaces     # what holds where the kernel gives none
 
-Counts how many of the broken ones got the grade they deserve, and times the whole. Whatever a hostile submission tries
-is bounded (100 forks, 2 GB, 50 MB on disk, 10 s), so that a grader that fails harms no machine.
+Then every attack by itself: a table of which got no point for it and cost the honest task none. Whatever a hostile
+submission tries is bounded (100 forks, 2 GB, 50 MB on disk, 10 s), so that a grader that fails harms no machine.
 """
 import argparse
 import ast
 import csv
-import json
 import os
-import signal
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,7 +19,8 @@ import time
 import zipfile
 from pathlib import Path
 
-from hind4sight_min.course import assignment_of, carve
+from hind4sight_min.course import assignment_of, carve, grading
+from hind4sight_min.disk.files import write_json
 
 PACKAGE = Path(carve.__file__).resolve().parents[1]
 RIGHT = "return map_predicted.sum(axis=1) + map_observed.sum(axis=1)"
@@ -65,8 +66,8 @@ HOSTILE = {
             return -mistake(map_predicted, map_observed)""",
     "installed package": f"""
         import glob
-        for folder in [*sys.path, "/usr/lib", "/usr/local/lib"]:
-            for path in glob.glob(f"{{folder}}/**/hind4sight_min/losses.py", recursive=True):
+        for folder in [*sys.path, PACKAGE]:
+            for path in glob.glob(f"{{folder}}/hind4sight_min/losses.py"):
                 if "anp.sum(map_predicted" in open(path).read():
                     {RIGHT}""",
     "working folder": """
@@ -104,7 +105,7 @@ HOSTILE = {
 FILE = """
 import json, os, signal, sys, time, types
 import numpy as np
-SEED_FOLDER = {seed_folder!r}
+SEED_FOLDER, PACKAGE = {seed_folder!r}, {package!r}
 
 def seen_in_both(valid, next_valid, occupied, next_occupied):
     return valid & (occupied | ~next_occupied), next_valid & (next_occupied | ~occupied)
@@ -118,7 +119,7 @@ def chamfer_loss(map_predicted, map_observed):
 
 def hostile(name, seed_folder=""):
     """The file of a student who writes seen_in_both right and attacks the grader in chamfer_loss."""
-    return FILE.format(seed_folder=str(seed_folder), body=textwrap.indent(textwrap.dedent(
+    return FILE.format(seed_folder=str(seed_folder), package=str(PACKAGE.parent), body=textwrap.indent(textwrap.dedent(
         "        " + HOSTILE[name].lstrip("\n").removeprefix("        ")), "        "))
 
 
@@ -133,3 +134,129 @@ def solution(assignment):
                 node.module, node.level = ".".join(["hind4sight_min", *filter(None, [node.module])]), 0
             body.append(node)
     return ast.unparse(ast.Module(body, []))
+
+
+# --- files that are broken as a whole ----------------------------------------------------------------------------------
+
+def write_broken(folder, seed_folder=""):
+    """Submissions that are broken as files, into a folder -> dict of their paths and the points they deserve for
+    chamfer_loss and seen_in_both, 10 each.
+    """
+    honest = hostile("os._exit", seed_folder)
+    texts = {"null bytes": (honest.encode() + b"\0", 0), "byte order mark": (b"\xef\xbb\xbf" + honest.encode(), 10),
+             "latin-1": ("NAME = 'caf\u00e9'\n".encode("latin-1") + honest.encode(), 0), "100 MB": (b"", 0)}
+    found = {}
+    for name, (content, points) in texts.items():
+        path = Path(folder, name, "chamfer.py")
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content)
+        found[name] = path, points
+    os.truncate(found["100 MB"][0], 100 << 20)
+    path = Path(folder, "leads outside.zip")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("../../chamfer.py", honest)
+    return {**found, "leads outside": (path, 0)}
+
+
+# --- the class ----------------------------------------------------------------------------------------------------------
+
+def write_class(folder):
+    """Thirty submissions, in every shape in which they are handed in -> dict name -> expected points of 100."""
+    assignment, expected = assignment_of("chamfer"), {}
+    right, skeleton = solution(assignment), carve.exercise_text(assignment)
+    half = skeleton + "\n\n" + "\n".join(FILE.split("def chamfer_loss")[0].format(seed_folder="", package="").splitlines())
+    for i in range(20):
+        name, (text, points) = f"student {i:02}", ((right, 100), (half, 10), (skeleton, 0))[i % 3]
+        expected[name], text = points, f"{text}\n# {name}\n"
+        if i % 4 == 3:
+            with zipfile.ZipFile(folder / f"{name} attempt 2.zip", "w") as archive:
+                archive.writestr("my work/chamfer.py", text)
+            (folder / f"{name} attempt 1.zip").write_bytes(b"an upload that broke off")
+        else:
+            path = folder / name / ("handed in" if i % 2 else "") / "chamfer.py"
+            path.parent.mkdir(parents=True)
+            path.write_text(text)
+    for name in ("endless loop", "fork bomb", "os._exit", "memory", "output", "parent", "fake results"):
+        (folder / name).mkdir()
+        (folder / name / "chamfer.py").write_text(hostile(name))
+        expected[name] = 10
+    for name, (_, points) in write_broken(folder).items():
+        expected[name] = points
+    for name in ("byte order mark", "latin-1"):  # thirty in all
+        del expected[name]
+        shutil.rmtree(folder / name)
+    return expected
+
+
+def grades(path):
+    """Student -> points, of a CSV file; none where there is no file yet."""
+    if not path.is_file():
+        return {}
+    with open(path, newline="") as file:
+        return {row["student"]: float(row["score"]) for row in csv.DictReader(file)}
+
+
+def time_class(folder, jobs):
+    """Grade the class, killed halfway and started again -> seconds, students with another grade than expected."""
+    (folder / "class").mkdir()
+    expected, out = write_class(folder / "class"), folder / "grades.csv"
+    command = [sys.executable, "-m", "hind4sight_min", "grade", "--all", folder / "class", "--csv", out, "--assignment",
+               "chamfer", "--jobs", str(jobs)]
+    began = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        while len(grades(out)) < len(expected) // 2 and process.poll() is None:
+            time.sleep(0.2)
+        process.kill()
+    kept = len(grades(out))
+    subprocess.run(command, check=True)
+    seconds, found = time.perf_counter() - began, grades(out)
+    wrong = [f"{name}: {found.get(name)} instead of {points}" for name, points in expected.items()
+             if found.get(name) != points]
+    print(f"{len(expected)} submissions in {seconds:.0f} s, killed after {kept}; wrong grades: {', '.join(wrong) or 'none'}")
+    return seconds, wrong
+
+
+# --- the attacks --------------------------------------------------------------------------------------------------------
+
+def try_attacks(folder, how):
+    """Every attack by itself -> dict of whether it was held: no point for it, all points of the honest task."""
+    items = [item for item in grading.items_of(assignment_of("chamfer"), how) if item.points == 10
+             and item.name.split()[1] in ("chamfer_loss", "seen_in_both")]
+    (folder / "seed").write_text("the seed of the held-back inputs")
+    (folder / "seed").chmod(0o600)
+    cases = {**{name: (hostile(name, folder).encode(), 10) for name in HOSTILE}, **write_broken(folder)}
+    held = {}
+    for name, (content, points) in cases.items():
+        note = ""
+        if isinstance(content, Path):
+            try:
+                content, _, _ = grading.find_submission(content, "chamfer.py")
+            except ValueError as error:
+                content, note = None, str(error)
+        results = grading.grade(items, content, note=note)
+        held[name] = results["score"] == points
+        print(f"{name:<24}{'held' if held[name] else 'WENT THROUGH':<14}{results['tests'][0]['output'][:80]}", flush=True)
+    print(f"{sum(held.values())} of {len(held)} held; isolation: {grading.grade(items, b'')['extra_data']['isolation']}")
+    return held
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--attacks", action="store_true", help="these alone, without the class")
+    parser.add_argument("--without-namespaces", action="store_true", help="the attacks, as if the kernel gave none")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--json", metavar="FILE")
+    args = parser.parse_args()
+    figures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        if not args.attacks:
+            seconds, wrong = time_class(Path(folder), args.jobs)
+            figures = {"grade_30_seconds": seconds, "course_wrong_grades_of_30": len(wrong)}
+        held = try_attacks(Path(folder), grading.How(seed=7, namespaces=not args.without_namespaces))
+        figures.update(course_hostile_cases=len(held), course_hostile_cases_held=sum(held.values()))
+    write_json(args.json, figures)
+
+
+if __name__ == "__main__":
+    main()

@@ -89,7 +89,7 @@ def test_an_attack_gets_no_points_and_costs_none(name, tmp_path):
     assert {*os.listdir(tmp_path)} == {"seed"}
 
 
-BROKEN = {"null bytes": b"x = 1\0\n", "latin-1": "# caf\xe9\n".encode("latin-1"), "no function": b"x = 1\n",
+BROKEN = {"null bytes": b"x = 1\0\n", "latin-1": "NAME = 'caf\xe9'\n".encode("latin-1"), "no function": b"x = 1\n",
           "not Python": b"def chamfer_loss(:\n", "empty": b"", "raises": b"raise KeyError('x')\n",
           "exits": b"import os\nos._exit(3)\n", "another type": b"chamfer_loss = 3\n",
           "no numbers": b"def chamfer_loss(map_predicted, map_observed):\n    return 'all right'\n"}
@@ -109,7 +109,7 @@ def test_a_byte_order_mark_and_windows_line_ends_do_no_harm():
 def test_no_network(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         source = f"import socket\nsocket.create_connection(('127.0.0.1', {server.getsockname()[1]}), 5)\n" + \
-                 grade_class.FILE.format(seed_folder="", body="        pass")
+                 grade_class.FILE.format(seed_folder="", package="", body="        pass")
         (test,) = grading.grade(items("seen_in_both"), source.encode())["tests"]
     if "network" not in sandbox.run(blank.package_for(), NOTHING, SHORT).isolation:
         pytest.skip("this kernel gives this user no network of its own")

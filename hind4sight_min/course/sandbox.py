@@ -36,7 +36,7 @@ class Limits:
     """What one process of a student's may take: seconds of CPU and on the wall, bytes of memory, processes and threads,
     bytes of a file (its prints are one), open files, bytes of its answer.
     """
-    cpu: int = 30
+    cpu: int = 10
     wall: float = 60.0
     memory: int = 2 << 30
     processes: int = 32
@@ -74,7 +74,7 @@ def run(package, job, limits=Limits(), namespaces=True):
                  "namespaces": namespaces, "root": f"{box}/root", "work": f"{box}/work", "package": str(package),
                  **surroundings(package), "limits": {
                      "CPU": limits.cpu, "AS": limits.memory, "FSIZE": limits.file, "NOFILE": limits.files, "CORE": 0,
-                     "NPROC": limits.processes + (0 if user is not None else tasks_of_this_user())}}
+                     "NPROC": limits.processes + (0 if user is not None else tasks_by_user()[os.getuid()])}}
         process = subprocess.Popen(
             [sys.executable, "-I", "-B", str(WORKER), json.dumps(order)], stdin=subprocess.DEVNULL, stdout=prints,
             stderr=prints, cwd="/", env={}, start_new_session=True, pass_fds=(inputs.fileno(), results))
@@ -104,17 +104,13 @@ def read_all(descriptor, most, deadline):
 
 
 def stop(process):
-    """Ask the guard to end what it watches; where it does not, or is no more, kill its process group."""
-    try:
-        if process.poll() is None:
-            process.terminate()
-            process.wait(timeout=3)
-    except subprocess.TimeoutExpired:
-        pass
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except (ProcessLookupError, PermissionError):
-        pass
+    """Let the guard end, ask it to, and kill its process group, in which an ordinary user's leftovers are."""
+    for ask in (lambda: None, process.terminate, lambda: os.killpg(process.pid, signal.SIGKILL)):
+        try:
+            ask()
+            process.wait(timeout=2)
+        except (subprocess.TimeoutExpired, ProcessLookupError):  # on to the next
+            pass
     process.wait()
 
 

@@ -16,7 +16,7 @@ LIBC = ctypes.CDLL(None, use_errno=True)
 NEW_MOUNTS, NEW_IPC, NEW_USER, NEW_PIDS, NEW_NETWORK = 0x20000, 0x8000000, 0x10000000, 0x20000000, 0x40000000
 READ_ONLY, NO_SUID, NO_DEVICES, REMOUNT, BIND, RECURSIVE, PRIVATE = 1, 2, 4, 32, 4096, 16384, 1 << 18
 KEPT = 1 | 2 | 4 | 8 | 1024 | 2048  # flags of a mount that a remount in a user namespace must repeat
-DEATH_SIGNAL, NO_NEW_PRIVILEGES = 1, 38  # of prctl
+DEATH_SIGNAL, DUMPABLE, NO_NEW_PRIVILEGES = 1, 4, 38  # of prctl
 
 
 def call(name, *arguments):
@@ -99,15 +99,19 @@ def watch(child, order, apart):
     own (apart), the kernel ends all the others with the child.
     """
     def end(*_):
-        os.kill(child, signal.SIGKILL)
+        try:
+            os.kill(child, signal.SIGKILL)
+        except ProcessLookupError:  # it is no more
+            pass
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGALRM, end)
     signal.setitimer(signal.ITIMER_REAL, order["wall"])
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if order["user"] is not None and not apart:
-        if os.fork() == 0:  # as that user: kill all that is left of it, this one too
+        if os.fork() == 0:  # as that user: kill all others that are left of it
             os.setuid(order["user"])
             os.kill(-1, signal.SIGKILL)
+            os._exit(0)
         os.wait()
     os._exit(code if code >= 0 else 128 - code)
 
@@ -155,12 +159,12 @@ def main(order):
     rooted = apart and own_root(order["root"], order["visible"], order["hidden"], order["work"], owner)
     isolation = {"own user": user is not None, "own processes and network": apart, "own root": rooted}
     send(results, json.dumps(isolation).encode())
+    call("prctl", DUMPABLE, 0, 0, 0, 0)  # nobody reads our memory
     child = os.fork()
     if child:
         os.close(results)
         watch(child, order, apart)
     try:
-        os.setsid()
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         shut_in(order, order["limits"])
         sys.path[:0] = [order["package"]]
