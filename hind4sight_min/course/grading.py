@@ -14,7 +14,7 @@ import threading
 import zipfile
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -110,10 +110,13 @@ class Item:
 
 @dataclass(frozen=True)
 class Mark:
-    """share: of the points, in [0, 1]. sentence: for the student. isolation: what was in force, in words."""
+    """share: of the points, in [0, 1]. sentence: for the student. isolation: what was in force, in words. figures: for
+    the leaderboard, name -> number, the smaller the better.
+    """
     share: float
     sentence: str
     isolation: str
+    figures: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -208,7 +211,8 @@ def mark_improved(assignment, how, content):
         ratio, error = improve.score(outcome.answer, how.pokes)
     except ValueError as error:
         return Mark(0.0, str(error), outcome.isolation)
-    return Mark(improve.share_of(ratio), f"flow_mse_ratio {ratio:.4f} \u00b1 {error:.4f}", outcome.isolation)
+    return Mark(improve.share_of(ratio), f"flow_mse_ratio {ratio:.4f} \u00b1 {error:.4f}", outcome.isolation,
+                {"flow_mse_ratio": round(ratio, 4)})
 
 
 def items_of(assignment, how):
@@ -245,6 +249,9 @@ def grade(items, content, out=None, only=None, note="", on_item=None):
             test.update(score=round(mark.share * item.points, 2), output=mark.sentence,
                         status="passed" if mark.share == 1 else "failed")
             results["extra_data"]["isolation"] = mark.isolation
+            if mark.figures:
+                results["leaderboard"] = [{"name": name, "value": value, "order": "asc"}
+                                          for name, value in mark.figures.items()]
         results["score"] = round(sum(each["score"] for each in tests), 2)
         results["extra_data"]["finished"] = item is items[-1]
         write_json(out, results)
@@ -294,15 +301,25 @@ def results_folder(out):
     return folder
 
 
+def write_csv(path, rows):
+    """Write dicts of the same keys as a CSV file, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
 def grade_all(folder, assignment, how, out, jobs=2, on_student=None):
     """Grade a folder of submissions -> rows, dicts, of the CSV file `out`, which is rewritten whole after each.
 
     Not in the paper: grading. What is finished lies beside it in OUT_results/, by the hash of the submission and of how
-    it was graded: started again, only what is missing is done. Students who hand in the same bytes share a grade.
+    it was graded: started again, only what is missing is done. Students who hand in the same bytes share a grade. What
+    goes by a figure has OUT_leaderboard.csv too, the best first.
     on_student(row, results) is called after each.
     """
     out, items, waiting, rows = Path(out), items_of(assignment, how), students(folder), {}
-    kept, locks = results_folder(out), defaultdict(threading.Lock)
+    kept, locks, places = results_folder(out), defaultdict(threading.Lock), []
 
     def one(name):
         content, note, where, attempts = None, "", "", len(waiting[name])
@@ -329,11 +346,12 @@ def grade_all(folder, assignment, how, out, jobs=2, on_student=None):
         for done in as_completed([pool.submit(one, name) for name in waiting]):
             row, results = done.result()
             rows[row["student"]] = row
-            text = io.StringIO()
-            writer = csv.DictWriter(text, row, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows[name] for name in waiting if name in rows)
-            write_text(out, text.getvalue())
+            write_csv(out, [rows[name] for name in waiting if name in rows])
+            places += [{"student": row["student"], each["name"]: each["value"]}
+                       for each in results.get("leaderboard", ())]
+            if places:
+                name = [*places[0]][1]
+                write_csv(out.with_name(f"{out.stem}_leaderboard.csv"), sorted(places, key=lambda place: place[name]))
             if on_student:
                 on_student(row, results)
     return [rows[name] for name in waiting]
