@@ -4,6 +4,7 @@ The reference carries no marks for it: a task names a function, and `ast` finds 
 """
 import ast
 import importlib.util
+import re
 import sys
 import sysconfig
 import textwrap
@@ -138,7 +139,7 @@ def yours(request, monkeypatch):
         carve.put_in_place(Path(__file__).with_name("{name}.py"), request.module, monkeypatch)
 '''
 
-TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of 2.1. Other tasks' functions are the reference's here."""
+TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of 2.1, with the reference's functions for other tasks."""
 from pathlib import Path
 
 import pytest
@@ -161,23 +162,33 @@ def readme(assignment):
     for task in tasks:
         rows.append(f"| {task.number} | `{task.function}` | {task.title} | {task.points} | {task.minutes} |")
         case = task.cases(np.random.default_rng(0))[0]
-        values = [(each, value) for each, value in case.items()]
         results = [("->", value) for value in answer(task, task.reference, case, 0).value]
-        hands.append(f"**{task.number} `{task.function}`** {task.notes}\n\n```\n"
-                     + "\n".join(_shown(*each) for each in values + results) + "\n```")
+        hands.append("\n".join([*textwrap.wrap(f"**{task.number} `{task.function}`** {task.notes}", 120), "", "```",
+                                *(_shown(*each) for each in [*case.items(), *results]), "```"]))
     first = tasks[0].number.replace(".", "_")
     return README.format(
         number=assignment.number, title=assignment.title, theory=assignment.theory, name=name, rows="\n".join(rows),
         points=sum(task.points for task in tasks), minutes=sum(task.minutes for task in tasks),
-        hands="\n\n".join(hands), first=first, task=tasks[0].number,
-        tests=" ".join(f"test_{each}.py" for each in assignment.tests) or "(none for this assignment)")
+        hands="\n\n".join(hands), first=first, task=tasks[0].number, tests=OWN_TESTS.format(
+            tests=" ".join(f"test_{each}.py" for each in assignment.tests)) if assignment.tests else "")
 
 
 def _shown(name, value):
-    text = np.array2string(np.asarray(value), precision=4, suppress_small=True, separator=", ", threshold=200)
-    return textwrap.indent(text, " " * (len(name) + 3)).replace(" " * (len(name) + 3), f"{name} = " if name != "->"
-                                                                else "->   ", 1)
+    """An array on lines of its own under its name and shape, axes of length 1 left out."""
+    value = np.asarray(value)
+    text = np.array2string(np.squeeze(value) if value.ndim > 1 else value, precision=4, suppress_small=True,
+                           separator=", ", threshold=200)
+    if value.ndim < 2:
+        return f"{name} {text}"
+    return f"{name} {value.shape}\n" + textwrap.indent(re.sub(r"\n\n+", "\n", text), "    ")
 
+
+OWN_TESTS = """
+    pytest -q                 # with the reference's own tests, {tests}
+
+There your functions stand in for the reference's all together, so some fail until all are written. These tests also ask
+for what the docstrings say of bad input ("Raises ValueError ..."), which carries no points.
+"""
 
 README = """# Assignment {number}: {title}
 
@@ -194,22 +205,23 @@ points, H x W pixels. {points} points, about {minutes} minutes.
 
 ## How to check
 
-    pytest -q -k {first}        # task {task} alone, a second or two
+    pytest -q -k {first}          # task {task} alone, a second or two
     pytest -q test_tasks.py   # all tasks
-    pytest -q                 # and the reference's own tests, with your functions in place of its own
 
 `test_tasks.py` compares shape, dtype, finite numbers, values and gradients, in this order, first on the case by hand
-below. Where it recognises a mistake it says which. A task does not depend on the others there: they are the
-reference's. The reference's own tests ({tests}) run your functions together, so they pass once all are written.
-
+below. Where it recognises a mistake it says which. A task does not depend on the others: the check takes the
+reference's functions for them.
+{tests}
 ## Cases by hand
+
+What goes in, and after the arrow what comes out, with shapes; axes of length 1 are not drawn.
 
 {hands}
 
 ## How it is graded
 
-As `test_tasks.py` does, with other numbers. Where a gradient is asked for, it counts half and the value half; `float32`
-in must give `float32` out. Arguments may not be changed in place.
+As `test_tasks.py` does, with other numbers. Where a gradient is asked for, it counts half and the value half. float32 in
+must give float32 out.
 
 All of the reference is public, in the installed package too. Copying it gives full marks and teaches nothing: this
 exercise is for learning, and your teacher knows it.

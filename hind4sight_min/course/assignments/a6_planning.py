@@ -97,7 +97,7 @@ def nearly_cases(rng):
     drawn[rng.random((2, 6, 5)) < 0.5] = np.nan
     drawn[:, 0] = np.nan
     drawn[:, 1, 4] = 1.0
-    return [by_hand, {"starts": drawn[0]}, single({"starts": drawn[1]})]
+    return [by_hand, {"starts": drawn[0]}, {"starts": drawn[1]}]
 
 
 # --- the cost ---
