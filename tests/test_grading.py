@@ -1,4 +1,5 @@
 """Grading holds: right submissions get their points, whatever a submission does to the grader gets it none."""
+import ast
 import csv
 import io
 import json
@@ -7,15 +8,23 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import zipfile
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hind4sight_min.course import assignment_of, blank, carve, channel, grading, sandbox
+from hind4sight_min.course import (ASSIGNMENTS, assignment_of, blank, bugs, bundle, carve, channel, grade_commands,
+                                   grading, improve, sandbox)
+from hind4sight_min.course.assignments import a8_improve
+from hind4sight_min.disk.shards import load_interactions
+from hind4sight_min.lab.cli import data_small, main
+from hind4sight_min.lab.evaluation import true_motion
+from hind4sight_min.sim.truth import load_truth
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -40,9 +49,15 @@ def scores(content, *functions, how=HOW):
 NOTHING = {"kind": "task", "files": {}, "file": "none.py", "number": "2.1", "cases": []}
 
 
-def left_behind():
-    """Processes of the user ids that students' code runs under."""
-    return [user for user in sandbox.tasks_by_user() if 60100 <= user < 64900]
+def left_behind(folder=None):
+    """Processes of students' code whose orders name a folder: this grader's copy of the package."""
+    found, folder = [], str(folder or blank.package_for("losses.chamfer_loss")).encode()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found += [path.parent.name] if b"worker.py" in (line := path.read_bytes()) and folder in line else []
+        except OSError:  # it has ended meanwhile
+            pass
+    return found
 
 
 # --- right and wrong ---------------------------------------------------------------------------------------------
@@ -73,6 +88,67 @@ def test_held_back_inputs_do_not_come_out_by_an_exception():
     assert "ValueError" in sentence and "array" not in sentence
     _, (sentence,) = scores(source, "chamfer_loss", how=replace(HOW, seed=None))
     assert "array" in sentence, "with public inputs it helps"
+
+
+@pytest.mark.parametrize("task", [task for assignment in ASSIGNMENTS for task in assignment.tasks],
+                         ids=lambda task: task.number)
+def test_what_the_student_gets_has_no_answer_in_it(task):
+    module, _, function = task.name.rpartition(".")
+    found = blank.blanked((blank.PACKAGE / f"{module.replace('.', '/')}.py").read_text(), function)
+    node, = [each for each in ast.parse(found).body if getattr(each, "name", None) == function]
+    assert ast.unparse(node.body) == blank.ASKED
+
+
+@pytest.mark.parametrize("path", sorted((blank.PACKAGE / "course" / "assignments").glob("a*.py")),
+                         ids=lambda path: path.stem)
+def test_neither_cases_nor_mistakes_nor_mutants_reach_the_student(path):
+    source = blank.without_answers(path.read_text())
+    names = {"__package__": "hind4sight_min.course.assignments", "__name__": path.stem}
+    exec(compile(source, path.name, "exec"), names)
+    assert all(task.cases is None and not task.mistakes for task in names.get("TASKS", ()))
+    assert "(rng):" not in source, "what draws the cases is still there"
+    assert bugs.MUTANTS[0].instead not in blank.without_mutants((blank.PACKAGE / "course" / "bugs.py").read_text())
+
+
+def test_a_measurement_that_tells_right_from_wrong_gets_its_points_and_one_that_asks_the_reference_none():
+    items = grading.items_of(assignment_of("bugs"), HOW)[:1]
+    right = (ROOT / "tests" / "course_measures.py").read_bytes()
+    compares = b"EXPECTED_01 = 0, 0\ndef measure_01(package):\n" \
+               b"    import hind4sight_min.geometry\n    return 0\n"
+    assert [grading.grade(items, content)["score"] for content in (right, compares)] == [bugs.POINTS, 0]
+
+
+# --- assignment 8 --------------------------------------------------------------------------------------------------
+
+def test_the_pokes_to_predict_come_without_what_came_of_them():
+    pokes = improve.question(None, 0)["pokes"]
+    np.testing.assert_array_equal(pokes["rgb_after"], pokes["rgb_before"])
+    np.testing.assert_array_equal(pokes["depth_after"], pokes["depth_before"])
+    assert [*pokes["meta"]] == ["settings"], "with the seed, the pokes can be simulated again"
+
+
+def test_the_score_is_that_of_the_metrics():
+    pokes, truth = load_interactions(data_small() / "test"), load_truth(data_small() / "test")
+    true = np.stack([true_motion(pokes, truth, row)[0] for row in range(len(pokes))])
+    assert [improve.score(share * true, None)[0] for share in (1, 0, 0.5)] == pytest.approx([0, 1, 0.25])
+    assert [improve.share_of(ratio) for ratio in (1, a8_improve.BASELINE, a8_improve.TARGET, 0)] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("flow, words", [(None, "NoneType"), (np.zeros((3, 3)), "(3, 3)"),
+                                         (np.full((400, 3072, 3), np.nan), "NaN"),
+                                         (np.zeros((400, 3072, 3), int), "int")])
+def test_what_is_no_scene_flow_is_refused(flow, words):
+    with pytest.raises(ValueError, match="predict") as caught:
+        improve.score(flow, None)
+    assert words in str(caught.value)
+
+
+def test_a_student_trains_and_predicts_in_the_sandbox():
+    source = b"import numpy as np\ndef train(interactions, seed):\n" \
+             b"    return lambda pokes: np.zeros((len(pokes), pokes.camera.height * pokes.camera.width, 3))\n"
+    results = grading.grade(grading.items_of(assignment_of("improve"), HOW), source)
+    assert results["leaderboard"] == [{"name": "flow_mse_ratio", "value": 1.0, "order": "asc"}]
+    assert results["score"] == 0, "no motion earns nothing"
 
 
 # --- hostile -----------------------------------------------------------------------------------------------------
@@ -230,18 +306,71 @@ def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_pat
     assert grading.grade_all(folder, CHAMFER, HOW, out) == rows
 
 
+def test_a_seed_is_a_number_or_a_file_that_not_everybody_reads(tmp_path):
+    path = tmp_path / "seed"
+    path.write_text("abc")
+    path.chmod(0o600)
+    tmp_path.chmod(0o755)
+    seeds = [grade_commands.seed_from(each) for each in ("17", path, None, None)]
+    assert seeds[0] == 17 and len({*seeds}) == 4 and grade_commands.seed_from(path) == seeds[1]
+    path.chmod(0o644)
+    with pytest.raises(ValueError, match="chmod 600") if os.getuid() == 0 else nullcontext():
+        grade_commands.seed_from(path)
+
+
+REFUSED = [([], "either a submission"), (["a", "--all", "b"], "either a submission"), (["--all", "b"], "--csv"),
+           (["--all", "b", "--csv", "c"], "--assignment"), (["nothing.py"], "--assignment"),
+           (["nothing", "--assignment", "9"], "assignment: expected"),
+           (["setup.cfg", "--assignment", "2", "--task", "x"], "no task x"),
+           (["--all", "b", "--csv", "{}/c.csv", "--assignment", "2"], "no such folder b")]
+
+
+@pytest.mark.parametrize("arguments, words", REFUSED)
+def test_the_command_says_in_one_line_what_it_cannot_do(arguments, words, tmp_path, capsys):
+    arguments = [each.format(tmp_path) for each in arguments]
+    assert main(["grade", *arguments, "--out", str(tmp_path / "results.json")]) == 2
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_the_command_grades_a_submission_without_a_file_with_nothing(tmp_path, capsys):
+    assert main(["grade", str(tmp_path), "--assignment", "2", "--out", str(tmp_path / "results.json")]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["score"] == 0 and "no chamfer.py" in results["output"] and "no chamfer.py" in capsys.readouterr().out
+
+
+def test_the_bundle_has_all_that_an_autograder_needs(tmp_path):
+    bundle.write_bundle(CHAMFER, tmp_path / "autograder.zip")
+    with zipfile.ZipFile(tmp_path / "autograder.zip") as archive:
+        archive.extractall(tmp_path / "source")
+        modes = {each.filename: each.external_attr >> 16 & 0o777 for each in archive.infolist()}
+    assert modes["setup.sh"] == modes["run_autograder"] == 0o755
+    assert len((tmp_path / "source" / "seed").read_text()) > 20
+    for name in ("setup.sh", "run_autograder"):
+        subprocess.run(["bash", "-n", tmp_path / "source" / name], check=True)
+    package = tmp_path / "source" / "package"
+    assert (package / "hind4sight_min" / "course" / "worker.py").is_file() and "numpy" in (
+        package / "pyproject.toml").read_text()
+    assert [*(package / "data_small" / "train").iterdir()] and not [*package.rglob("*.truth.npz")]
+    with pytest.raises(ValueError, match="--pokes"):
+        bundle.write_bundle(assignment_of("improve"), tmp_path / "autograder.zip")
+
+
 def test_a_killed_grader_leaves_whole_results_and_no_process(tmp_path):
     (tmp_path / "chamfer.py").write_text(grade_class.hostile("endless loop"))
-    process = subprocess.Popen([sys.executable, "-m", "hind4sight_min", "grade", tmp_path / "chamfer.py", "--task",
-                                "2.5", "--out", tmp_path / "results.json"], env={**os.environ, "PYTHONPATH": str(ROOT)})
-    while not left_behind() and process.poll() is None and os.getuid() == 0:
-        time.sleep(0.05)
-    time.sleep(0.5)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    for _ in range(60):
-        if not left_behind():
-            break
-        time.sleep(0.05)
-    assert not left_behind(), "the guard ends with the grader"
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o755)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hind4sight_min", "grade", tmp_path / "chamfer.py", "--assignment", "2", "--task",
+             "2.5", "--out", tmp_path / "results.json"],
+            env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": folder})
+        while len(left_behind(folder)) < 2 and process.poll() is None:  # the guard, and what it watches
+            time.sleep(0.05)
+        assert process.poll() is None
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        end = time.monotonic() + 5
+        while left_behind(folder) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert not left_behind(folder), "the guard ends with the grader"
     assert json.loads((tmp_path / "results.json").read_text())["tests"][0]["output"] == "Not graded yet."
