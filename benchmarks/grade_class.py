@@ -9,6 +9,7 @@ submission tries is bounded (100 forks, 2 GB, 50 MB on disk, 10 s), so that a gr
 import argparse
 import ast
 import csv
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -129,9 +130,10 @@ def solution(assignment):
     for module in modules:
         for node in ast.parse((PACKAGE / f"{module.replace('.', '/')}.py").read_text()).body:
             if isinstance(node, ast.ImportFrom) and node.level:
-                if node.module in modules:
+                package = ".".join(["hind4sight_min", *module.split(".")][:-node.level])
+                node.module, node.level = importlib.util.resolve_name("." + (node.module or ""), package).rstrip("."), 0
+                if node.module.removeprefix("hind4sight_min.") in modules:
                     continue
-                node.module, node.level = ".".join(["hind4sight_min", *filter(None, [node.module])]), 0
             body.append(node)
     return ast.unparse(ast.Module(body, []))
 
@@ -144,7 +146,7 @@ def write_broken(folder, seed_folder=""):
     """
     honest = hostile("os._exit", seed_folder)
     texts = {"null bytes": (honest.encode() + b"\0", 0), "byte order mark": (b"\xef\xbb\xbf" + honest.encode(), 10),
-             "latin-1": ("NAME = 'caf\u00e9'\n".encode("latin-1") + honest.encode(), 0), "100 MB": (b"", 0)}
+             "latin-1": ("NAME = 'caf\u00e9'\n".encode("latin-1") + honest.encode(), 10), "100 MB": (b"", 0)}
     found = {}
     for name, (content, points) in texts.items():
         path = Path(folder, name, "chamfer.py")

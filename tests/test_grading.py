@@ -31,7 +31,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import grade_class  # noqa: E402
 
 CHAMFER = assignment_of("chamfer")
-SHORT = sandbox.Limits(cpu=2, wall=20.0, memory=3 << 29)
+SHORT = sandbox.Limits(cpu=3, wall=60.0, memory=3 << 29)
 HOW = grading.How(seed=7, limits=SHORT)
 
 
@@ -84,8 +84,10 @@ def test_held_back_inputs_do_not_come_out_by_an_exception():
     source = b"def chamfer_loss(map_predicted, map_observed):\n" \
              b"    if map_predicted.shape[1] > 4: raise ValueError(repr(map_predicted))\n" \
              b"    return (map_predicted + map_observed).sum(axis=1)\n"
-    _, (sentence,) = scores(source, "chamfer_loss")
-    assert "ValueError" in sentence and "array" not in sentence
+    for exception in ("ValueError", "sys.exit", "type('array', (Exception,), {})"):
+        hostile = b"import sys\n" + source.replace(b"ValueError", exception.encode())
+        _, (sentence,) = scores(hostile, "chamfer_loss")
+        assert ("rror" in sentence or "xception" in sentence or "SystemExit" in sentence) and "array" not in sentence
     _, (sentence,) = scores(source, "chamfer_loss", how=replace(HOW, seed=None))
     assert "array" in sentence, "with public inputs it helps"
 
@@ -160,12 +162,12 @@ def test_an_attack_gets_no_points_and_costs_none(name, tmp_path):
     began = time.monotonic()
     shares, sentences = scores(grade_class.hostile(name, tmp_path).encode(), "chamfer_loss", "seen_in_both")
     assert shares == [0, 1], sentences
-    assert all(sentences) and time.monotonic() - began < 60
+    assert all(sentences) and time.monotonic() - began < 130
     assert not left_behind()
     assert {*os.listdir(tmp_path)} == {"seed"}
 
 
-BROKEN = {"null bytes": b"x = 1\0\n", "latin-1": "NAME = 'caf\xe9'\n".encode("latin-1"), "no function": b"x = 1\n",
+BROKEN = {"null bytes": b"x = 1\0\n", "no function": b"x = 1\n",
           "not Python": b"def chamfer_loss(:\n", "empty": b"", "raises": b"raise KeyError('x')\n",
           "exits": b"import os\nos._exit(3)\n", "another type": b"chamfer_loss = 3\n",
           "no numbers": b"def chamfer_loss(map_predicted, map_observed):\n    return 'all right'\n"}
@@ -177,9 +179,11 @@ def test_a_broken_file_gets_one_clear_sentence(name):
     assert share == 0 and "\n" not in sentence and 10 < len(sentence) < 400, sentence
 
 
-def test_a_byte_order_mark_and_windows_line_ends_do_no_harm():
-    source = b"\xef\xbb\xbf" + grade_class.hostile("os._exit").replace("\n", "\r\n").encode()
-    assert scores(source, "seen_in_both")[0] == [1]
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "latin-1", "utf-16"])
+def test_whatever_an_editor_saves_text_in_is_read(encoding, tmp_path):
+    text = "NAME = 'caf\xe9'\n" + grade_class.hostile("os._exit")
+    (tmp_path / "chamfer.py").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    assert scores(grading.find_submission(tmp_path, "chamfer.py")[0], "seen_in_both")[0] == [1]
 
 
 def test_no_network(tmp_path):
@@ -218,10 +222,15 @@ def test_arrays_that_are_not_what_they_say_are_refused(content):
         channel.decode([b'{"npy": 0}', memoryview(content)])
 
 
-@pytest.mark.parametrize("text", [b"", b"[" * 100000, b'{"npy": 5}', b'{"npy": -1}', b"\xff", b'{"npy": null}'])
+@pytest.mark.parametrize("text", [b"", b"[" * 100000, b"[" + b"{}," * 500000 + b"{}]", b'{"npy": 5}', b'{"npy": -1}', b"\xff", b'{"npy": null}'])
 def test_json_that_is_not_ours_is_refused(text):
     with pytest.raises(ValueError):
         channel.decode([text])
+
+
+def test_a_stream_of_empty_frames_does_not_fill_the_memory():
+    found, whole = channel.frames(bytes(8 * 100_000))
+    assert len(found) <= channel.MOST_FRAMES and not whole
 
 
 # --- submissions -------------------------------------------------------------------------------------------------
@@ -253,6 +262,7 @@ def refused_zips(folder):
     zipped(folder / "drive.zip", **{"c:\\chamfer.py": b""})
     zipped(folder / "bomb.zip", **{"chamfer.py": b"", "big": bytes(101 << 20)})
     zipped(folder / "long.zip", **{"chamfer.py": bytes(2 << 20)})
+    (folder / "null.py").write_bytes(b"x = 1\0")
     zipped(folder / "many.zip", **{f"{i}.py": b"" for i in range(2500)})
     (folder / "damaged.zip").write_bytes(b"PK\3\4 no zip")
     with open(folder / "chamfer.py", "wb") as file:
@@ -267,8 +277,8 @@ def test_what_is_too_large_or_leads_outside_is_refused_in_one_line(tmp_path):
     for path in refused_zips(tmp_path):
         with pytest.raises(ValueError) as caught:
             grading.find_submission(path, "chamfer.py")
-        assert "\n" not in str(caught.value) and path.name in str(caught.value), path
-    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 10
+        assert "\n" not in str(caught.value) and (path.name in str(caught.value) or path.stem == "null"), path
+    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 11
 
 
 # --- results -----------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import struct
 import numpy as np
 
 LENGTH = struct.Struct("<Q")
+MOST_FRAMES, MOST_JSON = 10_000, 1 << 20  # of a message; millions of tiny ones would fill the grader's memory
 
 
 def frame(content):
@@ -24,7 +25,7 @@ def frames(stream):
     Not in the paper: see `frame`.
     """
     stream, found, at = memoryview(stream), [], 0
-    while at + LENGTH.size <= len(stream):
+    while at + LENGTH.size <= len(stream) and len(found) < MOST_FRAMES:
         end = at + LENGTH.size + LENGTH.unpack_from(stream, at)[0]
         if end > len(stream):
             break
@@ -76,6 +77,8 @@ def decode(contents):
     Not in the paper: see the module.
     """
     try:
+        if len(contents[0]) > MOST_JSON:
+            raise ValueError(f"expected at most {MOST_JSON} bytes of JSON, got {len(contents[0])}")
         arrays = [load_npy(content) for content in contents[1:]]
         return json.loads(bytes(contents[0]),
                           object_hook=lambda each: arrays[each["npy"]] if [*each] == ["npy"] else each)

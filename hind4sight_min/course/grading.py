@@ -3,6 +3,8 @@
 A submission is the one file that the exercise asks for, NAME.py, wherever it lies in a folder, a zip file or alone. Its
 tasks are graded one by one, each in a process of its own (sandbox.py), and compared here, where that code never runs.
 """
+import builtins
+import codecs
 import csv
 import hashlib
 import io
@@ -14,7 +16,7 @@ import threading
 import zipfile
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +60,23 @@ def find_submission(path, name):
         raise ValueError(f"{path}: no such file or folder")
     if path.stat().st_size > MOST_SOURCE:
         raise ValueError(f"{path.name} has {path.stat().st_size >> 20} MB, at most {MOST_SOURCE >> 20} MB is read")
-    return path.read_bytes(), str(path), 1
+    return as_utf8(path.read_bytes()), str(path), 1
+
+
+def as_utf8(content):
+    """Source text in UTF-8, whatever an editor saved it in: also UTF-16 with its mark, and else Latin-1.
+
+    Not in the paper: grading. Raises ValueError for null bytes in it.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16", errors="replace").encode()
+    if b"\0" in content:
+        raise ValueError("there are null bytes in it: save it as plain text")
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        content = content.decode("latin-1").encode()
+    return content
 
 
 def ignored(path):
@@ -95,7 +113,7 @@ def read_zip(path, name):
         raise ValueError(f"{path.name}: a damaged or locked zip file ({error})") from None
     if len(content) > MOST_SOURCE:
         raise ValueError(f"{path.name}: {name} in it has more than {MOST_SOURCE >> 20} MB")
-    return content, f"{path}: {found[-1].filename}"
+    return as_utf8(content), f"{path}: {found[-1].filename}"
 
 
 # --- one task ----------------------------------------------------------------------------------------------------
@@ -131,29 +149,26 @@ class How:
 
 
 def mark_task(assignment, task, how, content):
-    """Grade one task -> Mark: half for the values, half for the gradients. Not in the paper: grading.
-
-    The inputs are drawn anew for every task; those the student does not have are told to nobody, not by way of an
-    exception's text either.
-    """
+    """Grade one task -> Mark: half for the values, half for the gradients. Not in the paper: grading."""
     rng = np.random.default_rng(0 if how.seed is None else [how.seed, *map(int, task.number.split("."))])
     cases, file = task.cases(rng), f"{assignment.name}.py"
     outcome = sandbox.run(blank.package_for(task.name), {
         "kind": "task", "files": {file: content}, "file": file, "number": task.number, "cases": cases},
         how.limits or sandbox.Limits(), how.namespaces)
     if outcome.failure:
-        return Mark(0.0, outcome.failure + (shown(outcome) if how.seed is None else ""), outcome.isolation)
+        missing = f"ValueError: {file}: there is no function {task.function}"
+        return Mark(0.0, failure_of(outcome, how, missing), outcome.isolation)
     try:
         answers = answers_from(outcome.answer)
         if how.seed is not None:
-            answers[1:] = [Answer(each.value, each.gradients, quiet(each.error)) for each in answers[1:]]
+            answers[1:] = [replace(each, error=quiet(each.error)) for each in answers[1:]]
         verdict = judge(task, cases, answers)
     except MemoryError:
         raise
     except Exception as error:  # answers of a form that no honest answer has
         return Mark(0.0, f"What came back is no answer ({type(error).__name__}).", outcome.isolation)
     sentence = sandbox.one_line(verdict.sentence, most=600) or "Right."
-    return Mark(verdict.share, sentence + (shown(outcome) if how.seed is None else ""), outcome.isolation)
+    return Mark(verdict.share, sentence + printed(outcome, how), outcome.isolation)
 
 
 def answers_from(raw):
@@ -168,13 +183,25 @@ def answers_from(raw):
 
 
 def quiet(error):
-    """An exception's type and line without its text, which could hold the inputs."""
-    return error and error.split(":")[0] + "".join(re.findall(r" \(line \d+", error)[-1:]).replace(" (", ", ")
+    """An exception's type and line. The rest could tell the student the inputs that are held back."""
+    if not error:
+        return error
+    name, line = error.partition(":")[0], re.search(r"line (\d{1,4})\b", error)
+    name = name if isinstance(getattr(builtins, name, None), type) else "an exception"
+    return f"{name} in line {line[1]}" if line else name
 
 
-def shown(outcome):
-    """The last of what the student's code printed, or nothing."""
-    return f"\nPrinted:\n{outcome.prints[-1000:]}" if outcome.prints.strip() else ""
+def failure_of(outcome, how, harmless=""):
+    """What to say where there is no answer; of an exception not its text, where inputs are held back, but `harmless`."""
+    if outcome.raised and how.seed is not None and outcome.failure != harmless:
+        return f"It raised {quiet(outcome.failure)}; on the public inputs you see the text."
+    return outcome.failure + printed(outcome, how)
+
+
+def printed(outcome, how):
+    """The last of what the student's code printed, for whoever has the inputs anyway, or nothing."""
+    text = "".join(each for each in outcome.prints[-1000:] if each.isprintable() or each == "\n").strip()
+    return f"\nPrinted:\n{text}" if text and how.seed is None else ""
 
 
 def mark_bug(assignment, number, how, content):
@@ -202,11 +229,11 @@ def measured(answer):
 def mark_improved(assignment, how, content):
     """Grade assignment 8 -> Mark: train in the student's process, score here. Not in the paper: grading."""
     file = f"{assignment.name}.py"
-    job = improve.question(how.pokes, seed=0 if how.seed is None else how.seed % 2 ** 32)
+    job = improve.question(how.pokes, seed=int(np.random.default_rng([how.seed or 0, 8]).integers(2 ** 31)))
     outcome = sandbox.run(blank.package_for(), {"kind": "improve", "files": {file: content}, "file": file, **job},
                           how.limits or improve.LIMITS, how.namespaces)
     if outcome.failure:
-        return Mark(0.0, outcome.failure + (shown(outcome) if how.seed is None else ""), outcome.isolation)
+        return Mark(0.0, failure_of(outcome, how), outcome.isolation)
     try:
         ratio, error = improve.score(outcome.answer, how.pokes)
     except ValueError as error:
@@ -288,7 +315,7 @@ def students(folder):
         raise ValueError(f"--all: no such folder {folder}")
     found = {}
     for path in sorted(Path(folder).iterdir(), key=lambda path: in_order(path.name)):
-        if not ignored(path.name) and (path.is_dir() or path.suffix.lower() in (".zip", ".py")):
+        if not ignored(path.name) and not path.is_symlink() and (path.is_dir() or path.suffix.lower() in (".zip", ".py")):
             name = path.name if path.is_dir() else path.stem
             found.setdefault(ATTEMPT.sub("", name) or name, []).append(path)
     return found

@@ -48,10 +48,11 @@ class Limits:
 @dataclass(frozen=True)
 class Outcome:
     """What came of one run. answer: what the student's process sent, or None. failure: why there is none, or "".
-    isolation: what was in force, in words. prints: the last of what it printed.
+    raised: whether that is an exception's text. isolation: what was in force, in words. prints: the last it printed.
     """
     answer: object
     failure: str
+    raised: bool
     isolation: str
     prints: str
 
@@ -122,7 +123,7 @@ def outcome(content, ending, code, prints, limits):
         raise RuntimeError(f"sandbox: the student's process cannot begin ({last[0]}); {sys.executable} and its "
                            "packages must be readable for every user, the limits large enough to import NumPy")
     in_force = [name for name, holds in json.loads(bytes(parts[0])).items() if holds]
-    answer, failure = None, ""
+    answer, failure, raised = None, "", False
     if ending == "size":
         failure = f"The answer is longer than {limits.answer >> 20} MB."
     elif whole and len(parts) > 2:
@@ -130,14 +131,15 @@ def outcome(content, ending, code, prints, limits):
             answer = channel.decode(parts[2:])
             if not isinstance(answer, dict) or [*answer] not in (["answer"], ["failed"]):
                 raise ValueError("it has another form")
-            failure = one_line(answer.get("failed", ""))
+            failure, raised = one_line(answer.get("failed", "")), "failed" in answer
         except ValueError as error:
             failure = f"What came back is no answer: {one_line(error)}."
     elif ending == "time" or code == 128 + signal.SIGKILL:
         failure = f"No answer within {limits.cpu} s of computing, {limits.wall:.0f} s in all: does every loop end?"
     else:
         failure = f"The process ended (exit status {code}) before it answered: does the code call exit()?"
-    return Outcome(None if failure else answer["answer"], failure, ", ".join([*in_force, "limits", "time-out"]), prints)
+    isolation = ", ".join([*in_force, "limits", "time-out"])
+    return Outcome(None if failure else answer["answer"], failure, raised, isolation, prints)
 
 
 def one_line(text, most=300):

@@ -79,7 +79,7 @@ def shut_in(order, limits):
         os.setgroups([])
         os.setgid(order["user"])
         os.setuid(order["user"])
-    LIBC.capset((ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)())  # what a user namespace brought
+    call("capset", (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)())  # gives up what a namespace brought
     call("prctl", NO_NEW_PRIVILEGES, 1, 0, 0, 0)
     os.umask(0o077)
     os.chdir(order["work"])
