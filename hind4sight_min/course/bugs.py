@@ -130,7 +130,7 @@ def measure(path, number, package):
             warnings.simplefilter("ignore")
             namespace = namespace_of(path)
             expected = namespace.get(f"EXPECTED_{number:02}")
-            if not isinstance(expected, tuple) or len(expected) != 2:
+            if not isinstance(expected, (tuple, list)) or len(expected) != 2:
                 raise ValueError(f"EXPECTED_{number:02}: expected (low, high), got {expected}")
             return float(expected[0]), float(expected[1]), float(namespace[f"measure_{number:02}"](package))
     except Exception as error:

@@ -137,12 +137,12 @@ def _weights(rng, value):
 def described(error):
     """One line of an exception, with the last line of the student's file that it went through."""
     text = f"{type(error).__name__}: {error}".split("\n")[0]
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__)
-              if "site-packages" not in frame.filename and "hind4sight_min" not in frame.filename]
-    if isinstance(error, NotImplementedError) or not frames:
+    places = [(frame, line) for frame, line in traceback.walk_tb(error.__traceback__)
+              if frame.f_globals.get("__name__", "").startswith("student_")]
+    if isinstance(error, NotImplementedError) or not places:
         return text
-    code = linecache.getline(frames[-1].filename, frames[-1].lineno).strip()
-    return f"{text} (line {frames[-1].lineno}: {code})"
+    frame, line = places[-1]
+    return f"{text} (line {line}: {linecache.getline(frame.f_code.co_filename, line).strip()})"
 
 
 def namespace_of(path):
