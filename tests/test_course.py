@@ -100,8 +100,8 @@ def test_there_are_enough_known_mistakes():
 
 # --- what a verdict says ------------------------------------------------------------------------------------------
 
-DOUBLE = Task("0.1", "planning.wrapped", "", 1, 1, lambda rng: [{"angle": np.array([1.0, 3])}, {"angle": rng.random(4) + 1}],
-              gradient=("angle",))
+DOUBLE = Task("0.1", "planning.wrapped", "", 1, 1, gradient=("angle",),
+              cases=lambda rng: [{"angle": np.array([1.0, 3])}, {"angle": rng.random(4) + 1}])
 
 
 @pytest.mark.parametrize("function, share, words", [
