@@ -50,6 +50,20 @@ def test_each_assignment_has_four_to_six_tasks_and_a_hundred_points():
             1, len(assignment.tasks) + 1)]
 
 
+@pytest.mark.parametrize("assignment", CARVED, ids=lambda each: each.name)
+def test_the_theory_points_to_what_there_is(assignment):
+    source = assignment.theory.rpartition("Paper: ")[2]
+    tutorials, pages = re.findall(r"`(\w+)`", source), re.findall(r"docs/\w+\.md", source)
+    assert tutorials or pages
+    assert all(list((ROOT / "tutorials").glob(f"[0-9]*_{name}.py")) for name in tutorials), tutorials
+    assert all((ROOT / page).is_file() for page in pages), pages
+
+
+def test_where_the_reference_fails_no_student_is_blamed():
+    with pytest.raises(RuntimeError, match="task 1.1: the reference fails: "):
+        judge(TASKS[0], [{"depth": None, "intrinsics": np.ones(4), "pose": np.eye(4)}], [])
+
+
 def filled(result, make):
     """A function's result with every array replaced, in tuples and in what a VJP returns too."""
     if callable(result):

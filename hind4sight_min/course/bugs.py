@@ -32,7 +32,8 @@ class Mutant(NamedTuple):
 
 MUTANTS = (
     Mutant("Whatever is seen stands some millimetres beside where it is, always to the same side, and the more the "
-           "further away it is. With the simulator's camera nothing is wrong: its optical axis goes through the middle of the picture.",
+           "further away it is. With the simulator's camera nothing is wrong: its optical axis goes through the middle "
+           "of the picture.",
            "geometry.py", "np.arange(camera.width) - camera.cx", "np.arange(camera.width) - (camera.width - 1) / 2"),
     Mutant("Small pushes are predicted well. Objects that turn by a quarter or more come out a little too large or too "
            "small, as if they were of rubber.",

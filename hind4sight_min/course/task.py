@@ -160,8 +160,14 @@ TOLERANCE = {4: 1e-4, 8: 1e-6}  # by bytes per number, of the largest number exp
 
 
 def judge(task, cases, answers):
-    """Compare with the reference: shape, dtype, finite numbers, value and gradient, in this order -> Verdict."""
+    """Compare with the reference: shape, dtype, finite numbers, value and gradient, in this order -> Verdict.
+
+    Raises RuntimeError where the reference itself fails: that is no student's fault.
+    """
     expected = answers_of(task, task.reference, cases)
+    for each in expected:
+        if each.error:
+            raise RuntimeError(f"task {task.number}: the reference fails: {each.error}")
     names = [f"case {i}" if i else "the case by hand" for i in range(len(cases))]
     in_value = in_gradient = ""
     for i, (found, wanted, name) in enumerate(zip(answers, expected, names)):
