@@ -11,6 +11,7 @@ import sys
 import tempfile
 import warnings
 from pathlib import Path
+from textwrap import fill
 from typing import NamedTuple
 
 from .task import Verdict, described, namespace_of
@@ -30,8 +31,9 @@ class Mutant(NamedTuple):
 
 
 MUTANTS = (
-    Mutant("Whatever is seen stands some millimetres beside where it is, the nearer the less, always to the same side. "
-           "With the simulator's camera nothing is wrong: its optical axis goes through the middle of the picture.",
+    Mutant("Whatever is seen stands some millimetres beside where it is, always to the same side, and the more the "
+           "further away it is. With the simulator's camera nothing is wrong: its optical axis goes through the middle "
+           "of the picture.",
            "geometry.py", "np.arange(camera.width) - camera.cx", "np.arange(camera.width) - (camera.width - 1) / 2"),
     Mutant("Small pushes are predicted well. Objects that turn by a quarter or more come out a little too large or too "
            "small, as if they were of rubber.",
@@ -130,7 +132,7 @@ def measure(path, number, package):
             warnings.simplefilter("ignore")
             namespace = namespace_of(path)
             expected = namespace.get(f"EXPECTED_{number:02}")
-            if not isinstance(expected, tuple) or len(expected) != 2:
+            if not isinstance(expected, (tuple, list)) or len(expected) != 2:
                 raise ValueError(f"EXPECTED_{number:02}: expected (low, high), got {expected}")
             return float(expected[0]), float(expected[1]), float(namespace[f"measure_{number:02}"](package))
     except Exception as error:
@@ -162,8 +164,10 @@ def judge(number, on_reference, on_mutant):
 
 def files(assignment):
     """Name -> text of the exercise."""
-    functions = [SKELETON.format(number=number, symptom=mutant.symptom) for number, mutant in enumerate(MUTANTS, 1)]
-    symptoms = "\n".join(f"{number}. {mutant.symptom}" for number, mutant in enumerate(MUTANTS, 1))
+    functions = [SKELETON.format(number=number, symptom=fill(mutant.symptom, 112, subsequent_indent=" " * 4))
+                 for number, mutant in enumerate(MUTANTS, 1)]
+    symptoms = "\n".join(fill(f"{number}. {mutant.symptom}", 118, subsequent_indent=" " * 4)
+                         for number, mutant in enumerate(MUTANTS, 1))
     readme = README.format(number=assignment.number, title=assignment.title, theory=assignment.theory,
                            symptoms=symptoms, points=POINTS)
     return {"bugs.py": HEAD + "".join(functions), "test_tasks.py": TEST, "README.md": readme}
@@ -226,7 +230,7 @@ What the users say:
 ## How it is graded
 
 Twelve times {points} points. Your file is given the right package and the one with the bug, both compiled and without
-sources, in fresh processes and in random order, and does not know which is which. The point is won if the number is
+sources, in fresh processes and in random order, and does not know which is which. The points are won if the number is
 inside of your range for the right one and outside for the other; an exception shows nothing. `hind4sight_min` cannot be
 imported meanwhile.
 

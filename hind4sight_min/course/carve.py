@@ -139,7 +139,7 @@ def yours(request, monkeypatch):
         carve.put_in_place(Path(__file__).with_name("{name}.py"), request.module, monkeypatch)
 '''
 
-TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of 2.1, with the reference's functions for other tasks."""
+TEST_TASKS = '''"""One check per task: pytest -k 2_1 runs that of 2.1, and the reference's functions for others."""
 from pathlib import Path
 
 import pytest
@@ -186,8 +186,8 @@ def _shown(name, value):
 OWN_TESTS = """
     pytest -q                 # with the reference's own tests, {tests}
 
-There your functions stand in for the reference's all together, so some fail until all are written. These tests also ask
-for what the docstrings say of bad input ("Raises ValueError ..."), which carries no points.
+There your functions stand in for the reference's all together, so some fail until all are written. These tests also
+ask for what the docstrings say of bad input ("Raises ValueError ..."), which carries no points.
 """
 
 README = """# Assignment {number}: {title}
@@ -220,8 +220,8 @@ What goes in, and after the arrow what comes out, with shapes; axes of length 1 
 
 ## How it is graded
 
-As `test_tasks.py` does, with other numbers. Where a gradient is asked for, it counts half and the value half. float32 in
-must give float32 out.
+As `test_tasks.py` does, with other numbers. Where a gradient is asked for, it counts half and the value half. float32
+in must give float32 out.
 
 All of the reference is public, in the installed package too. Copying it gives full marks and teaches nothing: this
 exercise is for learning, and your teacher knows it.

@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `hind4sight COMMAND --help`."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `COMMAND --help`."""
 import argparse
 import json
 import os

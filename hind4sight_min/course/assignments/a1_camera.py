@@ -25,7 +25,7 @@ help, and so does a tiny number under the root.
 **The poke's frame.** The model sees everything from the poke u = (a_x, a_y, a_theta): origin at its target on the
 table, x along its direction, so that p_arena = Q p_poke + o, with Q a turn by a_theta about z.
 
-Paper: Sec. III-A (Eq. 1) and III-C; lessons 01_point_clouds and 02_rigid_motion.
+Paper: Sec. III-A (Eq. 1) and III-C; the tutorials `point_clouds` and `rigid_motion`.
 """
 from dataclasses import replace
 

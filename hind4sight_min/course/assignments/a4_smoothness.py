@@ -18,7 +18,7 @@ the image of its own grid.
 
     L = lambda_1 (L_CD + L_ds) + lambda_2 (L_rec + L_fs) + lambda_3 L_inv                                 Eq. (6)
 
-Paper: Sec. III-D and III-F; lesson 05_smoothness.
+Paper: Sec. III-D and III-F; the tutorial `smoothness`.
 """
 from functools import partial
 

@@ -18,7 +18,7 @@ encoder would make L_sim small by saying nothing at all.
 less than PEAK around its centre is finer. The direction is that of the mean, over the start map, of the unit vectors
 from the cells' centres to the target.
 
-Paper: Sec. III-E; lesson 07_networks.
+Paper: Sec. III-E; docs/architecture.md.
 """
 import autograd.numpy as anp
 import numpy as np

@@ -19,7 +19,7 @@ objects are from the goal picture's, both in cm on the table, so that neither dr
     pixel_weight 100 mean_m max(|pixel_m - goal_m| pixel_size - SLACK, 0)
     + chamfer_weight 100 sqrt(mean_i min_j |P_i - G_j|^2 + mean_j min_i |P_i - G_j|^2)
 
-Paper: Sec. III-H and IV-G; lesson 10_planning.
+Paper: Sec. III-H and IV-G; the tutorial `planning`.
 """
 from dataclasses import replace
 
@@ -149,13 +149,13 @@ def table_too(clouds, view, goal, camera, search):
 def search_cases(rng):
     fixed = np.random.default_rng(0)
 
-    def drawn(rng, count, rounds, horizon):
+    def drawn(rng, count, elites, rounds, horizon):
         return {"population": np.float32(rng.uniform(-1, 1, (count, horizon, 3)) * [0.2, 0.2, 3.1]), "seed": count,
-                "rounds": rounds, "target": rng.uniform(-0.1, 0.1, (horizon, 3)) + [0, 0, 3.1]}
-    return [drawn(fixed, 5, 2, 1), drawn(rng, 12, 4, 2), drawn(rng, 8, 3, 2)]
+                "elites": elites, "rounds": rounds, "target": rng.uniform(-0.1, 0.1, (horizon, 3)) + [0, 0, 3.1]}
+    return [drawn(fixed, 5, 4, 2, 1), drawn(rng, 12, 4, 4, 2), drawn(rng, 8, 7, 3, 2)]
 
 
-def searched(function, population, seed, rounds, target):
+def searched(function, population, seed, elites, rounds, target):
     """-> the best sequence, its cost, and all that CEM asked the cost of. Some candidates cannot be."""
     asked, fits = [], []
 
@@ -166,9 +166,10 @@ def searched(function, population, seed, rounds, target):
         costs[1], costs[-2:] = np.nan, np.inf
         return costs + (0.5 if len(asked) == rounds else 0)  # the last round is a bad one
 
-    best, lowest = function(cost, population, np.random.default_rng(seed), Search(
-        candidates=len(population), elites=len(population) - 1, iterations=rounds),
-        lambda iteration, population, costs, mean, deviation: fits.append(np.stack([mean, deviation])))
+    def on_iteration(iteration, population, costs, mean, deviation):
+        fits.append(np.stack([mean, deviation]))
+    search = Search(candidates=len(population), elites=elites, iterations=rounds)
+    best, lowest = function(cost, population, np.random.default_rng(seed), search, on_iteration)
     return best, np.asarray(lowest), np.stack(asked), np.stack(fits)
 
 
