@@ -43,7 +43,8 @@ HOSTILE = {
     "os._exit": "os._exit(0)",
     "sys.exit": "sys.exit(0)",
     "memory": """
-        blocks = [np.ones(12_500_000) for _ in range(20)]""" + f"""
+        if "blocks" not in globals():
+            globals()["blocks"] = [np.zeros(12_500_000) for _ in range(20)]""" + f"""
         {RIGHT}""",
     "output": f"""
         for _ in range(50):
@@ -78,8 +79,8 @@ HOSTILE = {
         os.kill(os.getppid(), signal.SIGKILL)
         time.sleep(1)""",
     "memory of the grader": f"""
-        for _ in range(4):
-            pid = os.getppid() if _ == 0 else pid
+        pid = os.getppid()
+        for _ in range(2):  # the process that watches this one, and the grader
             try:
                 open(f"/proc/{{pid}}/mem", "rb").close()
                 {RIGHT}
@@ -138,7 +139,7 @@ def solution(assignment):
     return ast.unparse(ast.Module(body, []))
 
 
-# --- files that are broken as a whole ----------------------------------------------------------------------------------
+# --- files that are broken as a whole -------------------------------------------------------------------------
 
 def write_broken(folder, seed_folder=""):
     """Submissions that are broken as files, into a folder -> dict of their paths and the points they deserve for
@@ -160,13 +161,13 @@ def write_broken(folder, seed_folder=""):
     return {**found, "leads outside": (path, 0)}
 
 
-# --- the class ----------------------------------------------------------------------------------------------------------
+# --- the class ------------------------------------------------------------------------------------------------
 
 def write_class(folder):
     """Thirty submissions, in every shape in which they are handed in -> dict name -> expected points of 100."""
     assignment, expected = assignment_of("chamfer"), {}
     right, skeleton = solution(assignment), carve.exercise_text(assignment)
-    half = skeleton + "\n\n" + "\n".join(FILE.split("def chamfer_loss")[0].format(seed_folder="", package="").splitlines())
+    half = skeleton + FILE.split("def chamfer_loss")[0].format(seed_folder="", package="")
     for i in range(20):
         name, (text, points) = f"student {i:02}", ((right, 100), (half, 10), (skeleton, 0))[i % 3]
         expected[name], text = points, f"{text}\n# {name}\n"
@@ -214,11 +215,11 @@ def time_class(folder, jobs):
     seconds, found = time.perf_counter() - began, grades(out)
     wrong = [f"{name}: {found.get(name)} instead of {points}" for name, points in expected.items()
              if found.get(name) != points]
-    print(f"{len(expected)} submissions in {seconds:.0f} s, killed after {kept}; wrong grades: {', '.join(wrong) or 'none'}")
+    print(f"{len(expected)} submissions in {seconds:.0f} s, killed after {kept}; wrong: {', '.join(wrong) or 'none'}")
     return seconds, wrong
 
 
-# --- the attacks --------------------------------------------------------------------------------------------------------
+# --- the attacks ----------------------------------------------------------------------------------------------
 
 def try_attacks(folder, how):
     """Every attack by itself -> dict of whether it was held: no point for it, all points of the honest task."""
@@ -237,8 +238,10 @@ def try_attacks(folder, how):
                 content, note = None, str(error)
         results = grading.grade(items, content, note=note)
         held[name] = results["score"] == points
-        print(f"{name:<24}{'held' if held[name] else 'WENT THROUGH':<14}{results['tests'][0]['output'][:80]}", flush=True)
-    print(f"{sum(held.values())} of {len(held)} held; isolation: {grading.grade(items, b'')['extra_data']['isolation']}")
+        print(f"{name:<24}{'held' if held[name] else 'WENT THROUGH':<14}{results['tests'][0]['output'][:80]}",
+              flush=True)
+    isolation = grading.grade(items, b"")["extra_data"]["isolation"]
+    print(f"{sum(held.values())} of {len(held)} held; isolation: {isolation}")
     return held
 
 

@@ -5,7 +5,6 @@ frame is its length, eight bytes, and its bytes. The grader trusts nothing of it
 """
 import io
 import json
-import math
 import struct
 
 import numpy as np
@@ -56,7 +55,7 @@ def encode(value):
 def load_npy(content):
     """The array in the bytes of a .npy file. Raises ValueError unless it has as many real numbers as it says.
 
-    Not in the paper: a header may claim terabytes, or a type that runs code.
+    Not in the paper: a header may claim terabytes, or a type that runs code; what came is all that is allocated.
     """
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
@@ -65,8 +64,6 @@ def load_npy(content):
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
     if dtype.kind not in "biuf" or dtype.itemsize > 8 or not all(0 <= n < 2 ** 40 for n in shape) or len(shape) > 16:
         raise ValueError(f"array: expected real numbers of at most 8 bytes, got {dtype} of shape {shape}")
-    if math.prod(shape) * dtype.itemsize != len(content) - file.tell():
-        raise ValueError(f"array: {len(content) - file.tell()} bytes came for shape {shape} of {dtype}")
     flat = np.frombuffer(content, dtype, offset=file.tell()).copy()  # aligned, and writable
     return flat.reshape(shape, order="F" if fortran else "C")
 

@@ -192,7 +192,7 @@ def quiet(error):
 
 
 def failure_of(outcome, how, harmless=""):
-    """What to say where there is no answer; of an exception not its text, where inputs are held back, but `harmless`."""
+    """What to say where there is no answer; of an exception no text but `harmless`, where inputs are held back."""
     if outcome.raised and how.seed is not None and outcome.failure != harmless:
         return f"It raised {quiet(outcome.failure)}; on the public inputs you see the text."
     return outcome.failure + printed(outcome, how)
@@ -315,7 +315,8 @@ def students(folder):
         raise ValueError(f"--all: no such folder {folder}")
     found = {}
     for path in sorted(Path(folder).iterdir(), key=lambda path: in_order(path.name)):
-        if not ignored(path.name) and not path.is_symlink() and (path.is_dir() or path.suffix.lower() in (".zip", ".py")):
+        usual = path.is_dir() or path.suffix.lower() in (".zip", ".py")
+        if usual and not ignored(path.name) and not path.is_symlink():
             name = path.name if path.is_dir() else path.stem
             found.setdefault(ATTEMPT.sub("", name) or name, []).append(path)
     return found
