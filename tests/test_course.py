@@ -201,7 +201,7 @@ def test_a_task_does_not_depend_on_the_others(tmp_path):
 def pytest_in(folder, *arguments):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments], cwd=folder,
-                          env=environment, capture_output=True, text=True, timeout=60)
+                          env=environment, capture_output=True, text=True, timeout=300)
 
 
 def test_a_students_own_tests_run_one_task_or_one_equation_and_see_the_students_functions(tmp_path):
