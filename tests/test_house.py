@@ -30,7 +30,7 @@ def test_the_imports_of_a_file_are_found():
 @pytest.mark.parametrize("path", CORE, ids=lambda path: path.name)
 def test_the_core_imports_no_annex_and_opens_no_file(path):
     assert not [name for name in imported(path) if
-                re.match(r"hind4sight_min\.(sim|lab|disk)\b|pybullet|matplotlib|pathlib|json|io$", name)]
+                re.match(r"hind4sight_min\.(sim|lab|disk|course)\b|pybullet|matplotlib|pathlib|json|io$", name)]
 
 
 @pytest.mark.parametrize("path", sorted((PACKAGE / "sim").glob("*.py")), ids=lambda path: path.name)

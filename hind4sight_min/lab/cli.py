@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce; `hind4sight COMMAND --help`."""
+"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `COMMAND --help`."""
 import argparse
 import json
 import os
@@ -235,6 +235,18 @@ def run_demo(args):
     write_json(args.json or found, {f"demo_{name}": value for name, value in metrics.items()})
 
 
+# --- the course --------------------------------------------------------------------------------------------
+
+def run_course(args):
+    from ..course.commands import run_course
+    run_course(args)
+
+
+def run_grade(args):
+    from ..course.grade_commands import run_grade
+    run_grade(args)
+
+
 # --- the command line -----------------------------------------------------------------------------------------
 
 def term_weight(text):
@@ -313,6 +325,23 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
     "demo": (run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, train, "
              "evaluate and show on the shipped pokes", {
         "--out": {"default": "runs/demo"}, "--seed": SEED, "--jobs": JOBS, "--json": JSON}),
+    "course": (run_course, "exercises for a class: list them, or start one in a folder of its own", {
+        "action": {"choices": ("list", "start", "bundle"), "help": "bundle: an exercise's autograder, for Gradescope"},
+        "name": {"nargs": "?", "help": "number or name of the exercise"},
+        "--out": {"help": "a new folder, or for the bundle a .zip (the exercise's name)"},
+        "--seed": {"metavar": "FILE", "help": "bundle: of the held-back inputs (drawn)"},
+        "--pokes": {"metavar": "FOLDER", "help": "bundle of assignment 8: the held-back pokes, with their truth"}}),
+    "grade": (run_grade, "grade a submission of an assignment, each task in a process of its own; or a class of them", {
+        "folder": {"nargs": "?", "help": "submission: a folder, a zip file or the file itself"},
+        "--all": {"metavar": "FOLDER", "help": "a folder of submissions; with --csv and --assignment"},
+        "--csv": {"metavar": "FILE", "help": "the class's grades; details in FILE_results/, from which it goes on"},
+        "--assignment": {"metavar": "N", "help": "its number or name (what the submission's file is called)"},
+        "--task": {"metavar": "N.M", "help": "this task alone"},
+        "--public": {"action": "store_true", "help": "on the inputs that students have, with what their code prints"},
+        "--seed": {"metavar": "FILE", "help": "of the held-back inputs: a number, or a file students never see (drawn)"},
+        "--pokes": {"metavar": "FOLDER", "help": "assignment 8: held-back pokes, with their truth (the shipped ones)"},
+        "--out": {"default": "results.json", "help": "in Gradescope's format, whole after every task (results.json)"},
+        "--jobs": {"type": int, "default": 2, "help": "submissions at a time (2)"}}),
 }
 
 

@@ -1,0 +1,54 @@
+"""Grading of assignment 8: what the student's code is given, and the score of what it says."""
+from dataclasses import replace
+
+import numpy as np
+
+from ..disk.shards import load_interactions
+from ..interactions import PER_POKE
+from ..lab.cli import data_small
+from ..lab.evaluation import ratio_of, scenes_of_pokes, true_motion
+from ..sim.truth import load_truth
+from .assignments.a8_improve import BASELINE, MINUTES, TARGET
+from .sandbox import Limits
+
+LIMITS = Limits(cpu=60 * MINUTES, wall=180.0 * MINUTES, memory=3 << 30, processes=2)
+
+
+def question(folder, seed):
+    """Training pokes, and the pokes to predict without what came of them -> the arguments of `worker.improve`.
+
+    Not in the paper: grading. Nothing but the simulator's settings goes along: with its seed, pokes can be repeated.
+    """
+    pokes = load_interactions(folder or data_small() / "test")
+    blind = replace(pokes, rgb_after=pokes.rgb_before, depth_after=pokes.depth_before)
+
+    def plain(data):
+        arrays = {name: getattr(data, name) for name in (*PER_POKE, "empty_depth")}
+        return {**arrays, "camera": data.camera.plain, "meta": {"settings": data.settings}}
+    return {"interactions": plain(load_interactions(data_small() / "train")), "pokes": plain(blind), "seed": seed}
+
+
+def score(flow, folder):
+    """A predicted scene flow of all pokes (M, N, 3), m -> flow_mse_ratio as `evaluation.summary` has it, its SE.
+
+    Not in the paper: grading. Raises ValueError for another shape, and for what is no number.
+    """
+    folder = folder or data_small() / "test"
+    pokes, truth = load_interactions(folder), load_truth(folder)
+    expected = (len(pokes), pokes.camera.height * pokes.camera.width, 3)
+    if not isinstance(flow, np.ndarray) or flow.shape != expected or flow.dtype.kind != "f":
+        raise ValueError(f"predict: expected floating-point numbers of shape {expected}, got "
+                         f"{getattr(flow, 'dtype', type(flow).__name__)} {getattr(flow, 'shape', '')}")
+    if not np.isfinite(flow).all():
+        raise ValueError("predict: expected finite numbers, got NaN or infinity")
+    squared, motion = np.zeros(len(pokes)), np.zeros(len(pokes))
+    for row in range(len(pokes)):
+        true, _, moving = true_motion(pokes, truth, row)
+        squared[row] = np.sum((flow[row] - true)[moving].astype(float) ** 2)
+        motion[row] = np.sum(true[moving] ** 2)
+    return ratio_of(squared, motion, scenes_of_pokes(truth))
+
+
+def share_of(ratio):
+    """Of the points: none at the starter's ratio, all at the target, in between on the line from one to the other."""
+    return float(np.clip((BASELINE - ratio) / (BASELINE - TARGET), 0, 1))
