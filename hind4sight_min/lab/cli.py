@@ -338,7 +338,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--assignment": {"metavar": "N", "help": "its number or name (what the submission's file is called)"},
         "--task": {"metavar": "N.M", "help": "this task alone"},
         "--public": {"action": "store_true", "help": "on the inputs that students have, with what their code prints"},
-        "--seed": {"metavar": "FILE", "help": "of the held-back inputs: a number, or a file students never see (drawn)"},
+        "--seed": {"metavar": "FILE", "help": "of the held-back inputs: a number, or a file they never see (drawn)"},
         "--pokes": {"metavar": "FOLDER", "help": "assignment 8: held-back pokes, with their truth (the shipped ones)"},
         "--out": {"default": "results.json", "help": "in Gradescope's format, whole after every task (results.json)"},
         "--jobs": {"type": int, "default": 2, "help": "submissions at a time (2)"}}),
