@@ -3,7 +3,7 @@
     python benchmarks/grade_class.py --json class.json
     python benchmarks/grade_class.py --attacks --without-namespaces     # what holds where the kernel gives none
 
-Then every attack by itself: a table of which got no point for it and cost the honest task none. Whatever a hostile
+Then the student's loop: one function is changed and its own test run. Then every attack by itself: a table of which got no point for it and cost the honest task none. Whatever a hostile
 submission tries is bounded (100 forks, 2 GB, 50 MB on disk, 10 s), so that a grader that fails harms no machine.
 """
 import argparse
@@ -20,7 +20,7 @@ import time
 import zipfile
 from pathlib import Path
 
-from hind4sight_min.course import assignment_of, carve, grading
+from hind4sight_min.course import ASSIGNMENTS, assignment_of, carve, grading
 from hind4sight_min.disk.files import write_json
 
 PACKAGE = Path(carve.__file__).resolve().parents[1]
@@ -219,6 +219,19 @@ def time_class(folder, jobs):
     return seconds, wrong
 
 
+def time_student_loop(folder, rounds=3):
+    """From saving the file to the verdict on one task, in the exercise as it is handed out -> median of seconds."""
+    carve.start(assignment_of("chamfer"), folder / "exercise")
+    path, seconds = folder / "exercise" / "chamfer.py", []
+    for i in range(rounds):
+        path.write_text(path.read_text() + f"# {i}\n")
+        began = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "pytest", "-q", "-k", "2_3"], cwd=path.parent, capture_output=True)
+        seconds.append(time.perf_counter() - began)
+    print(f"one task's own test takes {sorted(seconds)[rounds // 2]:.1f} s")
+    return sorted(seconds)[rounds // 2]
+
+
 # --- the attacks ----------------------------------------------------------------------------------------------
 
 def try_attacks(folder, how):
@@ -257,7 +270,10 @@ def main():
         os.chmod(folder, 0o755)
         if not args.attacks:
             seconds, wrong = time_class(Path(folder), args.jobs)
-            figures = {"grade_30_seconds": seconds, "course_wrong_grades_of_30": len(wrong)}
+            tasks = [task for assignment in ASSIGNMENTS for task in assignment.tasks]
+            figures = {"grade_30_seconds": seconds, "course_wrong_grades_of_30": len(wrong),
+                       "student_loop_seconds": time_student_loop(Path(folder)), "course_tasks": len(tasks),
+                       "course_mistakes_with_feedback": sum(len(task.mistakes) for task in tasks)}
         held = try_attacks(Path(folder), grading.How(seed=7, namespaces=not args.without_namespaces))
         figures.update(course_hostile_cases=len(held), course_hostile_cases_held=sum(held.values()))
     write_json(args.json, figures)

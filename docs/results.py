@@ -104,9 +104,20 @@ HEADLINES = {
     "import_seconds": ("startup", "import_seconds", "import, seconds", "{:.2f}", "< 0.7"),
     "planted_faults_caught": ("planted_faults", "planted_faults_caught", "planted faults that the tests catch, of 80",
                               "{:.0f}", ">= 76"),
+    "course_tasks": ("grade_class", "course_tasks", "course: tasks of assignments 1 to 6", "{:.0f}", ""),
+    "course_mistakes_with_feedback": ("grade_class", "course_mistakes_with_feedback",
+                                      "course: mistakes that are told by a sentence", "{:.0f}", ">= 40"),
+    "course_hostile_cases_held": ("grade_class", "course_hostile_cases_held", "course: attacks held, of 20", "{:.0f}",
+                                  "20"),
+    "grade_30_seconds": ("grade_class", "grade_30_seconds", "course: seconds to grade a class of 30", "{:.0f}",
+                         "< 300"),
+    "student_loop_seconds": ("grade_class", "student_loop_seconds", "course: seconds from saving to the verdict",
+                             "{:.1f}", "< 3"),
     "core_lines": ("house", "core_lines", "lines of the core", "{:.0f}", "<= 1700"),
-    "package_lines": ("house", "package_lines", "lines of the package", "{:.0f}", "<= 4000"),
-    "test_lines": ("house", "test_lines", "lines of the tests", "{:.0f}", "<= 5000"),
+    "package_lines": ("house", "package_lines", "lines of the package, the course apart", "{:.0f}",
+                      "<= 4000"),
+    "course_lines": ("house", "course_lines", "lines of the course", "{:.0f}", ""),
+    "test_lines": ("house", "test_lines", "lines of the tests, the course's apart", "{:.0f}", "<= 5000"),
 }
 FRONT = ("demo_flow_mse_ratio", "shipped_flow_mse_ratio", "shipped_mask_iou", "shipped_inverse_direction_deg",
          "flow_mse_ratio_clean", "optical_epe_over_best_peer_moving", "plan_3_objects", "train_step_speedup_vs_torch")
@@ -201,8 +212,9 @@ def house():
     def lines(*patterns):
         return float(sum(len(path.read_text().splitlines()) for pattern in patterns for path in ROOT.glob(pattern)
                          if path.name != "__main__.py" or "**" in pattern))
-    return {"core_lines": lines("hind4sight_min/[!_]*.py"), "package_lines": lines("hind4sight_min/**/*.py"),
-            "test_lines": lines("tests/*.py")}
+    course, of_course = lines("hind4sight_min/course/**/*.py"), lines("tests/*course*.py", "tests/test_grading.py")
+    return {"core_lines": lines("hind4sight_min/[!_]*.py"), "course_lines": course,
+            "package_lines": lines("hind4sight_min/**/*.py") - course, "test_lines": lines("tests/*.py") - of_course}
 
 
 def gather():
