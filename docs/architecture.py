@@ -33,15 +33,16 @@ BOXES = {
     "trunk": (14.8, 7.7, "networks.forward_model\ntrunk and context", FORWARD),
     "masks": (18.9, 6.6, "networks.softmax\nmasks $m^k$", FORWARD),
     "motions": (18.9, 9.2, "networks._motions\ngeometry.so3_exp", FORWARD),
-    "eq1": (23.4, 7.7, "geometry.transform_layer\nEq. (1)", FORWARD),
-    "flow": (23.4, 5.7, "geometry.optical_flow\nprojection layer", FORWARD),
+    "eq1": (23.9, 7.7, "geometry.transform_layer\nEq. (1)", FORWARD),
+    "flow": (23.9, 5.7, "geometry.optical_flow\nprojection layer", FORWARD),
     "after": (0, 2.2, "after:\ndepth, $I_{t+1}$", INPUT),
     "scene2": (3.2, 2.2, "scene.scene_of\npoints, objects", INPUT),
-    "changed": (6.7, 4.0, "scene.most_changed\nof whole pictures", INVERSE),
-    "inverse": (11.8, 4.0, "networks.inverse_model", INVERSE),
+    "changed": (6.4, 4.0, "scene.most_changed\nof whole pictures", INVERSE),
+    "inverse": (12.3, 4.0, "networks.inverse_model", INVERSE),
     "embed": (11.8, 2.2, "networks.state_embedding\nof $P'_{t+1}$ and $P_{t+1}$", INVERSE),
-    "linv": (16.6, 3.2, "losses.inverse_loss\n$L_{act} + L_{sim}$", LOSS),
+    "linv": (16.2, 3.2, "losses.inverse_loss\n$L_{act} + L_{sim}$", LOSS),
     "eq3": (23.4, 3.5, "losses.photometric_loss  Eq. (3)\nlosses.flow_smoothness_loss  Eq. (4)", LOSS),
+    "binary": (19.8, 4.6, "losses.binary_mask_loss", LOSS),
     "eq25": (23.4, 1.4, "losses.chamfer_loss  Eq. (2)\nlosses.distance_smoothness_loss  Eq. (5)", LOSS),
     "eq6": (16.6, 0.9, "losses.full_loss\nEq. (6)", LOSS),
     "step": (12.6, 0.5, "training.adam\nor training.muon", LOSS),
@@ -55,7 +56,8 @@ ARROWS = (("seen", "scene", "depth"), ("scene", "look", "points"), ("look", "enc
           ("scene2", "embed", "points"), ("after", "scene2", "depth"),
           ("scene2", "changed", "points"), ("scene", "changed", "points"), ("changed", "inverse", "changed"),
           ("inverse", "linv", "heatmaps"), ("embed", "linv", "embedding"), ("linv", "eq6", "term"),
-          ("eq3", "eq6", "term"), ("eq25", "eq6", "term"), ("eq6", "step", "gradient"))
+          ("eq3", "eq6", "term"), ("masks", "binary", "masks"), ("binary", "eq6", "term"), ("eq25", "eq6", "term"),
+          ("eq6", "step", "gradient"))
 NOTES = ((23.4, 2.75, "with the images $I_t$, $I_{t+1}$"), (23.4, 0.65, "of $P'_{t+1}$ and $P_{t+1}$, with both images"))
 
 

@@ -3,7 +3,8 @@
 Question: no loss says what an object is. Do masks appear all the same, when, and what does the network get right first?
 
 Equations:
-- Eq. (6), the full loss: `training.loss_terms`, `losses.full_loss`; tests/test_eq6_full_loss.py
+- Eq. (6), the full loss, and a price on half masks: `training.loss_terms`, `losses.full_loss`,
+  `losses.binary_mask_loss`; tests/test_eq6_full_loss.py
 - Eq. (3), why it wants a little noise: `training.Recipe`; tests/test_training.py
 - Sec. III-G, the optimiser, batches, epochs: `training.adam`, `training.muon`, `training.rows_of_step`,
   `training.learning_rate`, `training.train`; tests/test_training.py
