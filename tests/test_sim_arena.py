@@ -55,7 +55,7 @@ def test_settings_accept_their_limits_and_leave_out_what_is_held_out():
     settings = Settings(objects_min=1, objects_max=MAX_OBJECTS, width=16, height=12, kinds=tuple(objects.KINDS),
                         textures=objects.TEXTURES, poke_length=(0.1, 0.2), place_within=1)
     for name, held_out in objects.HELD_OUT.items():
-        assert set(getattr(Settings(), name)) == set(getattr(settings, name)) - set(held_out)
+        assert set(getattr(Settings(), name)) == set(getattr(settings, name)) - {*held_out, "book"}
 
 
 @pytest.mark.parametrize("changed", [
@@ -247,6 +247,21 @@ def test_the_finger_pushes_ahead_what_it_can_and_stalls_at_its_force_limit(mass,
         assert np.abs(motion).max() < 1e-3
     else:  # as far as the finger is in its way, and it may slide on a little
         assert -touch - 0.002 < motion[0] < -touch + 0.01 and np.abs(motion[1]) < 0.004
+
+
+def test_a_book_that_is_pushed_in_its_middle_topples_and_is_seen_where_it_lies():
+    with alone("book", **SHARP) as arena:
+        put(arena, 0, 0)
+        assert arena.settle()
+        (_, depth, labels), before = arena.observe(), arena.poses()[0].astype(float)
+        arena.poke(np.float32([0, 0, np.pi / 2]), np.float32([0, -0.12]))
+        assert arena.settle()
+        (_, depth_after, labels_after), after = arena.observe(), arena.poses()[0].astype(float)
+    assert abs(Rotation.from_quat(after[3:]).as_matrix()[2, 2]) < 0.2 and np.abs(after[:2]).max() < 0.15, "it stands"
+    points = unproject(depth_after.astype(float), arena.camera)[labels_after == 1]
+    assert len(points) > 100 and points[:, 2].max() < 0.03 < unproject(depth, arena.camera)[labels == 1][:, 2].max()
+    local = (points - after[:3]) @ Rotation.from_quat(after[3:]).as_matrix()
+    assert (np.abs(local) < [0.037, 0.0105, 0.036]).all() and np.ptp(local[:, 2]) > 0.9 * 2 * before[2]
 
 
 @pytest.mark.parametrize("turn, beside", [(1.1, 0.6), (1.3, 0.5), (1.5, 0.5)])  # rad; of the object's radius

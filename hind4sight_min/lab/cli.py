@@ -80,7 +80,8 @@ def print_metrics(metrics):
 
 def run_collect(args):
     settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
-                        textures=tuple(args.textures), width=args.size[0], height=args.size[1])
+                        textures=tuple(args.textures), place_within=args.within, width=args.size[0],
+                        height=args.size[1])
     began = time.perf_counter()
     with parallel_map(args.jobs) as map:
         counts = collect(args.out, args.pokes, args.seed, settings, map, progress_line("collect"))
@@ -271,6 +272,8 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--pokes": {"type": int, "default": 1000}, "--seed": SEED,
         "--objects": {"type": int, "nargs": 2, "metavar": ("MIN", "MAX"), "help": "objects in a scene, 1 to 7",
                       "default": (Settings.objects_min, Settings.objects_max)},
+        "--within": {"type": float, "default": Settings.place_within,
+                     "help": f"part of the arena that they are put down in, at most 1 ({Settings.place_within})"},
         "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
                    "help": f"of the pictures, px, 4:3 ({Settings.width} {Settings.height})"},
         "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
