@@ -128,10 +128,11 @@ def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_
 @needs_bullet
 def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsys):
     assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures",
-               "rings", "--size", 96, 72, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
+               "rings", "--size", 96, 72, "--within", 0.5, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
     assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
     data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
     assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
+    assert data.settings["place_within"] == 0.5
     assert found["pokes_kept"] == 3 and found["collect_seconds"] > 0
     assert "3 pokes" in capsys.readouterr().out
 
@@ -213,7 +214,8 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     ("train pokes model.png", ["out", ".npz", "model.png"]), ("reproduce planning --out p --jobs 0", ["jobs", "0"]),
     ("collect c --pokes -5", ["pokes", "-5"]), ("collect c --objects 0 3", ["objects"]),
     ("collect c --kinds teapot", ["kinds", "teapot"]), ("collect c --textures tartan", ["textures", "tartan"]),
-    ("collect c --seed -1", ["seed"]), ("collect c --jobs 0", ["jobs"]), ("collect c --size 96 48", ["width", "96"])])
+    ("collect c --seed -1", ["seed"]), ("collect c --within 1.2", ["place_within", "1.2"]),
+    ("collect c --jobs 0", ["jobs"]), ("collect c --size 96 48", ["width", "96"])])
 def test_wrong_input_ends_in_one_line(arguments, words, small, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pokes").symlink_to(small / "train")

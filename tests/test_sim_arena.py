@@ -55,7 +55,7 @@ def test_settings_accept_their_limits_and_leave_out_what_is_held_out():
     settings = Settings(objects_min=1, objects_max=MAX_OBJECTS, width=16, height=12, kinds=tuple(objects.KINDS),
                         textures=objects.TEXTURES, poke_length=(0.1, 0.2), place_within=1)
     for name, held_out in objects.HELD_OUT.items():
-        assert set(getattr(Settings(), name)) == set(getattr(settings, name)) - set(held_out)
+        assert set(getattr(Settings(), name)) == set(getattr(settings, name)) - {*held_out, "book"}
 
 
 @pytest.mark.parametrize("changed", [
@@ -215,7 +215,7 @@ def test_the_finger_moves_straight_and_pushes_nothing_on_an_empty_path(start, ta
         path = track_of(arena, [*target, np.arctan2(travel[1], travel[0])], start)
         assert np.abs(arena.poses() - before)[0, :2].max() < 1e-4
     along, offset = travel / np.linalg.norm(travel), path[:, :2] - start
-    assert np.abs(along[0] * offset[:, 1] - along[1] * offset[:, 0]).max() < 5e-4, "the path is bent"
+    assert np.abs(along[0] * offset[:, 1] - along[1] * offset[:, 0]).max() < 1e-3, "the path is bent"
     assert (np.diff(offset @ along) > -1e-5).all() and np.abs(path[:, 2]).max() < 1e-4
     np.testing.assert_allclose(path[-1, :2], target, atol=3e-4)
     assert np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).max() * 240 == pytest.approx(0.25, rel=0.01)
@@ -237,6 +237,38 @@ def test_the_finger_pushes_ahead_what_it_can_and_stalls_at_its_force_limit(mass,
         assert np.abs(motion).max() < 1e-3
     else:  # as far as the finger is in its way, and it may slide on a little
         assert -touch - 0.002 < motion[0] < -touch + 0.01 and np.abs(motion[1]) < 0.004
+
+
+def test_a_book_that_is_pushed_in_its_middle_topples_and_is_seen_where_it_lies():
+    with alone("book", **SHARP) as arena:
+        put(arena, 0, 0)
+        assert arena.settle()
+        (_, depth, labels), before = arena.observe(), arena.poses()[0].astype(float)
+        arena.poke(np.float32([0, 0, np.pi / 2]), np.float32([0, -0.12]))
+        assert arena.settle()
+        (_, depth_after, labels_after), after = arena.observe(), arena.poses()[0].astype(float)
+    assert abs(Rotation.from_quat(after[3:]).as_matrix()[2, 2]) < 0.2 and np.abs(after[:2]).max() < 0.15, "it stands"
+    points = unproject(depth_after.astype(float), arena.camera)[labels_after == 1]
+    assert len(points) > 100 and points[:, 2].max() < 0.03 < unproject(depth, arena.camera)[labels == 1][:, 2].max()
+    local = (points - after[:3]) @ Rotation.from_quat(after[3:]).as_matrix()
+    assert (np.abs(local) < [0.037, 0.0105, 0.036]).all() and np.ptp(local[:, 2]) > 0.9 * 2 * before[2]
+
+
+@pytest.mark.parametrize("turn, beside", [(1.1, 0.6), (1.3, 0.5), (1.5, 0.5)])  # rad; of the object's radius
+def test_the_finger_does_not_squeeze_an_object_out_of_the_arenas_corner(turn, beside):
+    with alone("carton", **FAST) as arena:
+        corner, fastest, step = 0.249 - 0.99 * arena.radii[0], [], arena._step
+        arena.put(0, (corner, corner), turn - 2 * np.arctan2(*arena.poses()[0, 5:]))
+        assert arena.settle()
+
+        def stepping(count):
+            for _ in range(count):
+                step(1)
+                fastest.append(np.linalg.norm(arena.bullet.getBaseVelocity(arena.bodies[0])[0]))
+        arena._step = stepping
+        y = arena.poses()[0, 1] + beside * arena.radii[0]
+        arena.poke(np.float32([0.2125, y, 0]), np.float32([0.0725, y]))
+    assert 0.2 < max(fastest) < 2 * arena.settings.finger_speed, "it shoots away like a seed: too much force?"
 
 
 @pytest.mark.parametrize("radius, farthest", [(0.01, 0.2375), (0.014, 0.2125)])  # clear of the walls, not farther off

@@ -20,7 +20,7 @@ from ..sim.arena import Settings
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import load_truth
-from . import control, evaluation, tables
+from . import contact, control, evaluation, tables
 from .noise import under_noise
 from .processes import parallel_map
 from .runs import train_saving
@@ -80,7 +80,8 @@ def print_metrics(metrics):
 
 def run_collect(args):
     settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
-                        textures=tuple(args.textures), width=args.size[0], height=args.size[1])
+                        textures=tuple(args.textures), place_within=args.within, width=args.size[0],
+                        height=args.size[1])
     began = time.perf_counter()
     with parallel_map(args.jobs) as map:
         counts = collect(args.out, args.pokes, args.seed, settings, map, progress_line("collect"))
@@ -154,10 +155,13 @@ def run_show(args):
 
 def run_reproduce(args):
     from . import figures
-    control_experiment = args.table == "planning"
-    out = Path(args.out or ("runs/planning" if control_experiment
+    out = Path(args.out or (f"runs/{args.table}" if args.table in ("planning", "contact")
                             else "runs/reproduce-quick" if args.quick else "runs/reproduce"))
-    if control_experiment:
+    if args.table == "contact":
+        found = contact.reproduce(checkpoints.load_run(args.checkpoint), 100 if args.quick else 1000, args.jobs,
+                                  progress_line("poke"))
+        print(contact.contact_table(found))
+    elif args.table == "planning":
         found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
         print(tables.planning_table(found))
         figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
@@ -283,6 +287,8 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--pokes": {"type": int, "default": 1000}, "--seed": SEED,
         "--objects": {"type": int, "nargs": 2, "metavar": ("MIN", "MAX"), "help": "objects in a scene, 1 to 7",
                       "default": (Settings.objects_min, Settings.objects_max)},
+        "--within": {"type": float, "default": Settings.place_within,
+                     "help": f"part of the arena that they are put down in, at most 1 ({Settings.place_within})"},
         "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
                    "help": f"of the pictures, px, 4:3 ({Settings.width} {Settings.height})"},
         "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
@@ -316,11 +322,12 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--out": {"default": "runs/plan", "help": "folder for plan.gif"}, "--json": JSON}),
     "reproduce": (run_reproduce, "the paper's tables at our scale, over several seeds: hours, in which it can be "
                   "stopped and started again (needs pybullet)", {
-        "table": {"choices": [*tables.TABLES, "all", "planning"],
-                  "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G"},
-        "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan with (the shipped one)"},
+        "table": {"choices": [*tables.TABLES, "all", "planning", "contact"],
+                  "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G; "
+                  "contact: a model's error by what met what, in minutes"},
+        "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with (the shipped one)"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
-        "--out": {"help": "folder of data and runs (runs/reproduce, runs/reproduce-quick, runs/planning)"},
+        "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
         "--jobs": JOBS, "--json": JSON}),
     "demo": (run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, train, "
              "evaluate and show on the shipped pokes", {

@@ -35,9 +35,9 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
 # --- tasks --------------------------------------------------------------------------------------------------------
 
-def settings_for(run):
-    """SETTINGS of the test scenes, in pictures of the size that a run was trained with."""
-    return replace(SETTINGS, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
+def settings_for(run, settings=SETTINGS):
+    """Settings, those of the test scenes, in pictures of the size that a run was trained with."""
+    return replace(settings, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
 
 
 @dataclass

@@ -43,7 +43,7 @@ class Settings:
     pokes_per_scene: int = 6
     poke_length: tuple = (0.10, 0.14)
     finger_radius: float = 0.01
-    finger_force: float = 25.0
+    finger_force: float = 5.0  # 25 N squeeze objects out of corners like seeds
     finger_speed: float = 0.25
     width: int = 64
     height: int = 48
@@ -282,7 +282,8 @@ class Arena:
     def poke(self, poke, start):
         """Lower the finger at `start` (2,) m, push in a straight line to the target of `poke` (3,), lift it.
 
-        Both axes share the speed in proportion, so the path is straight; each gives up at the force limit.
+        Both axes share the speed in proportion, so the path is straight, to a millimetre while they gather speed; each
+        gives up at the force limit.
         Returns True when everything came to rest.
         """
         p, s = self.bullet, self.settings

@@ -16,14 +16,14 @@ from .truth import Truth, save_truth, truth_path
 SHARD_POKES = 100  # one shard is one world, so the data do not depend on who collects it
 
 
-def collect_shard(settings, seed, index, pokes):
-    """Collect one shard -> (Interactions, Truth). The same arguments give the same data.
+def collect_shard(settings, seed, index, pokes, world=Arena):
+    """Collect one shard -> (Interactions, Truth). The same arguments give the same data. world: what makes the Arena.
 
     Interactions are dropped, and counted in meta["counts"], when an object left the arena, is out of the camera's
     sight, or never came to rest. Raises ValueError for settings under which that is nearly always so.
     """
     kept, counts = [], Counter(kept=0, left_arena=0, out_of_view=0, not_at_rest=0, no_free_start=0)
-    with Arena(settings, np.random.default_rng([seed, index])) as arena:
+    with world(settings, np.random.default_rng([seed, index])) as arena:
         left = 0  # pokes that the scene is still good for
         while len(kept) < pokes:
             if not left:
