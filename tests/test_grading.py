@@ -120,6 +120,11 @@ def test_a_measurement_that_tells_right_from_wrong_gets_its_points_and_one_that_
     assert [grading.grade(items, content)["score"] for content in (right, compares)] == [bugs.POINTS, 0]
 
 
+def test_a_measurement_too_large_to_be_a_float_is_no_answer():
+    assert grading.measured([0.0, 1.0, 10 ** 400]) == "what came back is no answer"
+    assert grading.measured([0.0, 1.0, 2.0]) == (0, 1, 2)
+
+
 # --- assignment 8 ---------------------------------------------------------------------------------------------
 
 def test_the_pokes_to_predict_come_without_what_came_of_them():
@@ -217,7 +222,7 @@ def npy(text):
     npy("{'descr': '|O', 'fortran_order': False, 'shape': (0,)}"),
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"),
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': ()}") + b"1234",
-    npy("__import__('os')._exit(1)"), b"", b"\0"])
+    npy("__import__('os')._exit(1)"), npy("-" * 9000 + "1"), b"", b"\0"])
 def test_arrays_that_are_not_what_they_say_are_refused(content):
     with pytest.raises(ValueError):
         channel.decode([b'{"npy": 0}', memoryview(content)])
@@ -252,6 +257,11 @@ def test_the_last_attempt_by_name_is_found_wherever_it_lies(tmp_path):
     assert grading.find_submission(tmp_path / "Ann Lee", "chamfer.py")[::2] == (b"attempt 10", 2)
     path = zipped(tmp_path / "bo.zip", **{"__MACOSX/a/z/chamfer.py": b"no", "a/b/chamfer.py": b"yes"})
     assert grading.find_submission(path, "chamfer.py")[0] == b"yes"
+
+
+def test_names_are_sorted_as_people_count_whatever_is_in_them():
+    names = ["a", "a 002", "a 10", "a 10\u00b2", "a " + "9" * 5000, "\u00b2"]
+    assert sorted(names[::-1], key=grading.in_order) == names
 
 
 def refused_zips(folder):

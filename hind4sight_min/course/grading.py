@@ -34,7 +34,8 @@ MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the f
 
 def in_order(text):
     """A key that sorts names as people count: attempt 2 before attempt 10. Not in the paper: grading."""
-    return [(int(each), "") if each.isdigit() else (0, each) for each in re.split(r"(\d+)", str(text).lower())]
+    pieces = [each.lstrip("0") if each.isdecimal() else each for each in re.split(r"(\d+)", str(text).lower())]
+    return [(len(each) * each.isdecimal(), each) for each in pieces]  # as numbers they may be too long for int
 
 
 def find_submission(path, name):
@@ -221,8 +222,8 @@ def mark_bug(assignment, number, how, content):
 
 def measured(answer):
     """Three numbers, or a str that says what went wrong: all that `bugs.judge` is to be given."""
-    if isinstance(answer, list) and len(answer) == 3 and all(isinstance(each, (int, float)) for each in answer):
-        return tuple(float(each) for each in answer)
+    if isinstance(answer, list) and [type(each) for each in answer] == [float] * 3:
+        return tuple(answer)
     return answer if isinstance(answer, str) else "what came back is no answer"
 
 
