@@ -191,6 +191,12 @@ def test_whatever_an_editor_saves_text_in_is_read(encoding, tmp_path):
     assert scores(grading.find_submission(tmp_path, "chamfer.py")[0], "seen_in_both")[0] == [1]
 
 
+def test_a_file_that_says_its_encoding_is_left_alone():
+    said = "# coding: gbk\nNAME = '\u6df1\u5ea6'\n".encode("gbk")
+    assert grading.as_utf8(said) == said
+    assert grading.as_utf8("# coding: utf-8\nx = 1  # caf\xe9\n".encode("latin-1")).decode().endswith("caf\xe9\n")
+
+
 def test_no_network(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         source = f"import socket\nsocket.create_connection(('127.0.0.1', {server.getsockname()[1]}), 5)\n" + \
@@ -264,6 +270,13 @@ def test_names_are_sorted_as_people_count_whatever_is_in_them():
     assert sorted(names[::-1], key=grading.in_order) == names
 
 
+def test_zips_as_windows_and_macs_write_them_are_read(tmp_path):
+    path = zipped(tmp_path / "a.zip", **{"work\\chamfer.py": b"windows"})
+    assert grading.find_submission(path, "chamfer.py")[0] == b"windows"
+    path = zipped(tmp_path / "a.zip", **{"Homework 2: Ann/chamfer.py": b"mac", "z/chamfer.py/": b"a folder"})
+    assert grading.find_submission(path, "chamfer.py")[0] == b"mac"
+
+
 def refused_zips(folder):
     link = zipfile.ZipInfo("chamfer.py")
     link.external_attr = 0o120777 << 16
@@ -276,6 +289,7 @@ def refused_zips(folder):
     zipped(folder / "long.zip", **{"chamfer.py": bytes(2 << 20)})
     (folder / "null.py").write_bytes(b"x = 1\0")
     zipped(folder / "many.zip", **{f"{i}.py": b"" for i in range(2500)})
+    (folder / "millions.zip").write_bytes(b"PK\1\2" * 2_000_000)
     (folder / "damaged.zip").write_bytes(b"PK\3\4 no zip")
     with open(folder / "chamfer.py", "wb") as file:
         file.truncate(100 << 20)
@@ -290,7 +304,7 @@ def test_what_is_too_large_or_leads_outside_is_refused_in_one_line(tmp_path):
         with pytest.raises(ValueError) as caught:
             grading.find_submission(path, "chamfer.py")
         assert "\n" not in str(caught.value) and (path.name in str(caught.value) or path.stem == "null"), path
-    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 11
+    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 12
 
 
 # --- results -----------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import random
 import re
 import stat
 import threading
+import tokenize
 import zipfile
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -65,7 +66,8 @@ def find_submission(path, name):
 
 
 def as_utf8(content):
-    """Source text in UTF-8, whatever an editor saved it in: also UTF-16 with its mark, and else Latin-1.
+    """Source text in UTF-8, whatever an editor saved it in: also UTF-16 with its mark, and else Latin-1; as it is where
+    it says in a comment, `# coding: gbk`, what it is in.
 
     Not in the paper: grading. Raises ValueError for null bytes in it.
     """
@@ -74,8 +76,9 @@ def as_utf8(content):
     if b"\0" in content:
         raise ValueError("there are null bytes in it: save it as plain text")
     try:
-        content.decode()
-    except UnicodeDecodeError:
+        if tokenize.detect_encoding(io.BytesIO(content).readline)[0] in ("utf-8", "utf-8-sig"):
+            content.decode()
+    except (SyntaxError, UnicodeDecodeError):  # SyntaxError: already in its first lines
         content = content.decode("latin-1").encode()
     return content
 
@@ -93,17 +96,21 @@ def read_zip(path, name):
     path = Path(path)
     if path.stat().st_size > MOST_ZIP:
         raise ValueError(f"{path.name} has {path.stat().st_size >> 20} MB, at most {MOST_ZIP >> 20} MB are read")
+    if path.read_bytes().count(b"PK\1\2") > 2 * MOST_MEMBERS:  # before zipfile makes an object of each
+        raise ValueError(f"{path.name}: more than {MOST_MEMBERS} files in it")
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
+            for each in members:
+                each.filename = each.filename.replace("\\", "/")  # as some Windows programs write it
             if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > MOST_ZIP:
                 raise ValueError(f"{path.name}: more than {MOST_MEMBERS} files or {MOST_ZIP >> 20} MB in it")
             for each in members:
-                parts = each.filename.replace("\\", "/").split("/")
-                if ".." in parts or parts[0] == "" or ":" in parts[0] or stat.S_ISLNK(each.external_attr >> 16):
+                parts = each.filename.split("/")
+                if ".." in parts or parts[0] == "" or parts[0][1:2] == ":" or stat.S_ISLNK(each.external_attr >> 16):
                     raise ValueError(f"{path.name}: refused, for {each.filename!r} in it leads out of its folder")
             found = sorted((each for each in members if Path(each.filename).name == name
-                            and not ignored(each.filename)), key=lambda each: in_order(each.filename))
+                            and not each.is_dir() and not ignored(each.filename)), key=lambda each: in_order(each.filename))
             if not found:
                 raise ValueError(f"{path.name}: there is no {name} in it")
             with archive.open(found[-1]) as file:
