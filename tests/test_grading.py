@@ -332,14 +332,38 @@ def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_pat
     zipped(folder / "Di attempt 10.zip", **{"x/chamfer.py": right})
     zipped(folder / "Ed.zip", **{"../chamfer.py": right})
     (folder / "Flo").mkdir()
+    for name in (b"=cmd()", b"a\nb", b"\xff\xfe"):
+        (folder / os.fsdecode(name) / "chamfer.py").mkdir(parents=True)  # a folder of that name
+        os.mkfifo(folder / os.fsdecode(name) / "chamfer.py" / "chamfer.py")
     few = items("seen_in_both")
     monkeypatch.setattr(grading, "items_of", lambda *_: few)
     rows = grading.grade_all(folder, CHAMFER, HOW, out)
     found = {row["student"]: float(row["score"]) for row in csv.DictReader(io.StringIO(out.read_text()))}
-    assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0}
-    assert "'../chamfer.py'" in rows[4]["note"] and "no chamfer.py" in rows[5]["note"]
+    assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0, "'=cmd()": 0, "a?b": 0,
+                     "??": 0}
+    notes = {row["student"]: row["note"] for row in rows}
+    assert "'../chamfer.py'" in notes["Ed"] and "no chamfer.py" in notes["Flo"] and notes["??"] == notes["Flo"]
     monkeypatch.setattr(sandbox, "run", None)  # what is finished is not run again
     assert grading.grade_all(folder, CHAMFER, HOW, out) == rows
+
+
+def test_what_no_one_foresaw_costs_a_class_one_student(tmp_path, monkeypatch):
+    for name in ("Ann", "Bo", "Cy"):
+        (tmp_path / "class" / name).mkdir(parents=True)
+
+    def found(path, name):
+        if path.name == "Cy":
+            raise RecursionError("too deep")
+        return path.name.encode(), "", 1
+
+    def mark(content):
+        if content == b"Bo":
+            raise KeyError("ours")
+        return grading.Mark(1.0, "Right.", "limits")
+    monkeypatch.setattr(grading, "find_submission", found)
+    monkeypatch.setattr(grading, "items_of", lambda *_: [grading.Item("2.5 f", 5, mark)])
+    rows = grading.grade_all(tmp_path / "class", CHAMFER, HOW, tmp_path / "grades.csv")
+    assert [(row["score"], row["note"]) for row in rows] == [(5, ""), (0, "NOT GRADED: 'ours'"), (0, "too deep")]
 
 
 def test_a_seed_is_a_number_or_a_file_that_not_everybody_reads(tmp_path):
@@ -358,13 +382,15 @@ REFUSED = [([], "either a submission"), (["a", "--all", "b"], "either a submissi
            (["--all", "b", "--csv", "c"], "--assignment"), (["nothing.py"], "--assignment"),
            (["nothing", "--assignment", "9"], "assignment: expected"),
            (["setup.cfg", "--assignment", "2", "--task", "x"], "no task x"),
-           (["--all", "b", "--csv", "{}/c.csv", "--assignment", "2"], "no such folder b")]
+           (["--all", "b", "--csv", "{}/c.csv", "--assignment", "2"], "no such folder b"),
+           (["--all", "b", "--csv", "b/c.csv", "--assignment", "2"], "outside of b"),
+           (["a", "--assignment", "8"], "--pokes"), (["a", "--assignment", "2", "--out", "a/chamfer.py"], "--out")]
 
 
 @pytest.mark.parametrize("arguments, words", REFUSED)
 def test_the_command_says_in_one_line_what_it_cannot_do(arguments, words, tmp_path, capsys):
     arguments = [each.format(tmp_path) for each in arguments]
-    assert main(["grade", *arguments, "--out", str(tmp_path / "results.json")]) == 2
+    assert main(["grade", "--out", str(tmp_path / "results.json"), *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
 

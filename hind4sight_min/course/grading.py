@@ -9,6 +9,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 import random
 import re
 import stat
@@ -19,6 +20,7 @@ from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +173,7 @@ def mark_task(assignment, task, how, content):
         if how.seed is not None:
             answers[1:] = [replace(each, error=quiet(each.error)) for each in answers[1:]]
         verdict = judge(task, cases, answers)
-    except MemoryError:
+    except (MemoryError, RuntimeError):  # ours: the reference itself fails
         raise
     except Exception as error:  # answers of a form that no honest answer has
         return Mark(0.0, f"What came back is no answer ({type(error).__name__}).", outcome.isolation)
@@ -213,17 +215,20 @@ def printed(outcome, how):
 
 
 def mark_bug(assignment, number, how, content):
-    """Grade one measurement of assignment 7 -> Mark, on the right package and on the mutant, in random order.
+    """Grade one measurement of assignment 7 -> Mark, on the right package and on the mutant, one of them twice.
 
-    Not in the paper: grading.
+    Not in the paper: grading. The order is drawn, and so is that in which the packages are made: the clock, or the age
+    of a file, would tell them apart. Tossing a coin succeeds in one case of eight.
     """
-    found, file = {}, f"{assignment.name}.py"
-    for which in random.sample((0, number), 2):
+    for which in random.sample(range(len(bugs.MUTANTS) + 1), len(bugs.MUTANTS) + 1):
+        blank.package_for(which)
+    found, file = {0: [], number: []}, f"{assignment.name}.py"
+    for which in random.sample((0, number, random.choice((0, number))), 3):
         outcome = sandbox.run(blank.package_for(which), {
             "kind": "bug", "files": {file: content}, "file": file, "number": number},
             how.limits or sandbox.Limits(), how.namespaces)
-        found[which] = outcome.failure or measured(outcome.answer)
-    verdict = bugs.judge(number, found[0], found[number])
+        found[which].append(outcome.failure or measured(outcome.answer))
+    verdict = min((bugs.judge(number, *pair) for pair in product(found[0], found[number])), key=lambda each: each.share)
     return Mark(verdict.share, sandbox.one_line(verdict.sentence) or "Right.", outcome.isolation)
 
 
@@ -337,6 +342,12 @@ def results_folder(out):
     return folder
 
 
+def as_cell(text):
+    """Text for a CSV file and a terminal: printable, and no formula to a spreadsheet. Not in the paper: grading."""
+    text = "".join(each if each.isprintable() else "?" for each in text)
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+
+
 def write_csv(path, rows):
     """Write dicts of the same keys as a CSV file, whole or not at all."""
     text = io.StringIO()
@@ -363,25 +374,26 @@ def grade_all(folder, assignment, how, out, jobs=2, on_student=None):
             content, where, inside = find_submission(waiting[name][-1], f"{assignment.name}.py")
             attempts += inside - 1
             key = hashlib.sha256(f"{assignment.number} {how.seed} {how.pokes}\n".encode() + content).hexdigest()[:20]
-        except (ValueError, OSError) as error:
-            note, key = sandbox.one_line(error), hashlib.sha256(name.encode()).hexdigest()[:20]
+        except Exception as error:  # also a folder too deep to walk through
+            note, key = sandbox.one_line(error), hashlib.sha256(os.fsencode(name)).hexdigest()[:20]
         path = kept / f"{key}.json"
         with locks[key]:
             results = json.loads(path.read_text()) if content is not None and path.is_file() else None
             if not (results and results["extra_data"]["finished"]):
                 try:
                     results = grade(items, content, path, note=note)
-                except RuntimeError as error:  # the sandbox could not even begin: this is not the student's fault
+                except Exception as error:  # ours, as where the sandbox could not begin: not the student's fault
                     note, results = f"NOT GRADED: {error}", json.loads(path.read_text())
-        row = {"student": name, "score": results["score"], "of": total_of(results), "attempts": attempts,
-               "file": where, "note": note, "results": path.name,
+        row = {"student": as_cell(name), "score": results["score"], "of": total_of(results), "attempts": attempts,
+               "file": as_cell(where), "note": as_cell(note), "results": path.name,
                **{test["name"].split()[0]: test["score"] for test in results["tests"]}}
         return row, results
 
     with ThreadPoolExecutor(jobs) as pool:
-        for done in as_completed([pool.submit(one, name) for name in waiting]):
+        running = {pool.submit(one, name): name for name in waiting}
+        for done in as_completed(running):
             row, results = done.result()
-            rows[row["student"]] = row
+            rows[running[done]] = row
             write_csv(out, [rows[name] for name in waiting if name in rows])
             places += [{"student": row["student"], each["name"]: each["value"]}
                        for each in results.get("leaderboard", ())]
