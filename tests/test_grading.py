@@ -134,6 +134,14 @@ def test_the_pokes_to_predict_come_without_what_came_of_them():
     assert [*pokes["meta"]] == ["settings"], "with the seed, the pokes can be simulated again"
 
 
+def test_no_picture_to_predict_from_shows_what_came_of_another_poke():
+    pokes, _ = improve.asked(data_small() / "test")
+    everything = load_interactions(data_small() / "test")
+    after = {each.tobytes() for each in everything.depth_after}
+    assert 50 < len(pokes) < len(everything) and not after & {each.tobytes() for each in pokes.depth_before}
+    assert after & {each.tobytes() for each in everything.depth_before}, "in a whole scene there are such"
+
+
 def test_the_score_is_that_of_the_metrics():
     pokes, truth = load_interactions(data_small() / "test"), load_truth(data_small() / "test")
     true = np.stack([true_motion(pokes, truth, row)[0] for row in range(len(pokes))])
@@ -143,6 +151,7 @@ def test_the_score_is_that_of_the_metrics():
 
 @pytest.mark.parametrize("flow, words", [(None, "NoneType"), (np.zeros((3, 3)), "(3, 3)"),
                                          (np.full((400, 3072, 3), np.nan), "NaN"),
+                                         (np.full((400, 3072, 3), 1e200), "10 m"),
                                          (np.zeros((400, 3072, 3), int), "int")])
 def test_what_is_no_scene_flow_is_refused(flow, words):
     with pytest.raises(ValueError, match="predict") as caught:
