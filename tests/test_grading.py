@@ -120,6 +120,11 @@ def test_a_measurement_that_tells_right_from_wrong_gets_its_points_and_one_that_
     assert [grading.grade(items, content)["score"] for content in (right, compares)] == [bugs.POINTS, 0]
 
 
+def test_a_measurement_too_large_to_be_a_float_is_no_answer():
+    assert grading.measured([0.0, 1.0, 10 ** 400]) == "what came back is no answer"
+    assert grading.measured([0.0, 1.0, 2.0]) == (0, 1, 2)
+
+
 # --- assignment 8 ---------------------------------------------------------------------------------------------
 
 def test_the_pokes_to_predict_come_without_what_came_of_them():
@@ -127,6 +132,14 @@ def test_the_pokes_to_predict_come_without_what_came_of_them():
     np.testing.assert_array_equal(pokes["rgb_after"], pokes["rgb_before"])
     np.testing.assert_array_equal(pokes["depth_after"], pokes["depth_before"])
     assert [*pokes["meta"]] == ["settings"], "with the seed, the pokes can be simulated again"
+
+
+def test_no_picture_to_predict_from_shows_what_came_of_another_poke():
+    pokes, _ = improve.asked(data_small() / "test")
+    everything = load_interactions(data_small() / "test")
+    after = {each.tobytes() for each in everything.depth_after}
+    assert 50 < len(pokes) < len(everything) and not after & {each.tobytes() for each in pokes.depth_before}
+    assert after & {each.tobytes() for each in everything.depth_before}, "in a whole scene there are such"
 
 
 def test_the_score_is_that_of_the_metrics():
@@ -138,6 +151,7 @@ def test_the_score_is_that_of_the_metrics():
 
 @pytest.mark.parametrize("flow, words", [(None, "NoneType"), (np.zeros((3, 3)), "(3, 3)"),
                                          (np.full((400, 3072, 3), np.nan), "NaN"),
+                                         (np.full((400, 3072, 3), 1e200), "10 m"),
                                          (np.zeros((400, 3072, 3), int), "int")])
 def test_what_is_no_scene_flow_is_refused(flow, words):
     with pytest.raises(ValueError, match="predict") as caught:
@@ -186,6 +200,12 @@ def test_whatever_an_editor_saves_text_in_is_read(encoding, tmp_path):
     assert scores(grading.find_submission(tmp_path, "chamfer.py")[0], "seen_in_both")[0] == [1]
 
 
+def test_a_file_that_says_its_encoding_is_left_alone():
+    said = "# coding: gbk\nNAME = '\u6df1\u5ea6'\n".encode("gbk")
+    assert grading.as_utf8(said) == said
+    assert grading.as_utf8("# coding: utf-8\nx = 1  # caf\xe9\n".encode("latin-1")).decode().endswith("caf\xe9\n")
+
+
 def test_no_network(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         source = f"import socket\nsocket.create_connection(('127.0.0.1', {server.getsockname()[1]}), 5)\n" + \
@@ -217,7 +237,7 @@ def npy(text):
     npy("{'descr': '|O', 'fortran_order': False, 'shape': (0,)}"),
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"),
     npy("{'descr': '<f8', 'fortran_order': False, 'shape': ()}") + b"1234",
-    npy("__import__('os')._exit(1)"), b"", b"\0"])
+    npy("__import__('os')._exit(1)"), npy("-" * 9000 + "1"), b"", b"\0"])
 def test_arrays_that_are_not_what_they_say_are_refused(content):
     with pytest.raises(ValueError):
         channel.decode([b'{"npy": 0}', memoryview(content)])
@@ -254,6 +274,18 @@ def test_the_last_attempt_by_name_is_found_wherever_it_lies(tmp_path):
     assert grading.find_submission(path, "chamfer.py")[0] == b"yes"
 
 
+def test_names_are_sorted_as_people_count_whatever_is_in_them():
+    names = ["a", "a 002", "a 10", "a 10\u00b2", "a " + "9" * 5000, "\u00b2"]
+    assert sorted(names[::-1], key=grading.in_order) == names
+
+
+def test_zips_as_windows_and_macs_write_them_are_read(tmp_path):
+    path = zipped(tmp_path / "a.zip", **{"work\\chamfer.py": b"windows"})
+    assert grading.find_submission(path, "chamfer.py")[0] == b"windows"
+    path = zipped(tmp_path / "a.zip", **{"Homework 2: Ann/chamfer.py": b"mac", "z/chamfer.py/": b"a folder"})
+    assert grading.find_submission(path, "chamfer.py")[0] == b"mac"
+
+
 def refused_zips(folder):
     link = zipfile.ZipInfo("chamfer.py")
     link.external_attr = 0o120777 << 16
@@ -266,6 +298,7 @@ def refused_zips(folder):
     zipped(folder / "long.zip", **{"chamfer.py": bytes(2 << 20)})
     (folder / "null.py").write_bytes(b"x = 1\0")
     zipped(folder / "many.zip", **{f"{i}.py": b"" for i in range(2500)})
+    (folder / "millions.zip").write_bytes(b"PK\1\2" * 2_000_000)
     (folder / "damaged.zip").write_bytes(b"PK\3\4 no zip")
     with open(folder / "chamfer.py", "wb") as file:
         file.truncate(100 << 20)
@@ -280,7 +313,7 @@ def test_what_is_too_large_or_leads_outside_is_refused_in_one_line(tmp_path):
         with pytest.raises(ValueError) as caught:
             grading.find_submission(path, "chamfer.py")
         assert "\n" not in str(caught.value) and (path.name in str(caught.value) or path.stem == "null"), path
-    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 11
+    assert time.monotonic() - began < 10 and len(list(tmp_path.iterdir())) == 12
 
 
 # --- results -----------------------------------------------------------------------------------------------------
@@ -308,14 +341,38 @@ def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_pat
     zipped(folder / "Di attempt 10.zip", **{"x/chamfer.py": right})
     zipped(folder / "Ed.zip", **{"../chamfer.py": right})
     (folder / "Flo").mkdir()
+    for name in (b"=cmd()", b"a\nb", b"\xff\xfe"):
+        (folder / os.fsdecode(name) / "chamfer.py").mkdir(parents=True)  # a folder of that name
+        os.mkfifo(folder / os.fsdecode(name) / "chamfer.py" / "chamfer.py")
     few = items("seen_in_both")
     monkeypatch.setattr(grading, "items_of", lambda *_: few)
     rows = grading.grade_all(folder, CHAMFER, HOW, out)
     found = {row["student"]: float(row["score"]) for row in csv.DictReader(io.StringIO(out.read_text()))}
-    assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0}
-    assert "'../chamfer.py'" in rows[4]["note"] and "no chamfer.py" in rows[5]["note"]
+    assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0, "'=cmd()": 0, "a?b": 0,
+                     "??": 0}
+    notes = {row["student"]: row["note"] for row in rows}
+    assert "'../chamfer.py'" in notes["Ed"] and "no chamfer.py" in notes["Flo"] and notes["??"] == notes["Flo"]
     monkeypatch.setattr(sandbox, "run", None)  # what is finished is not run again
     assert grading.grade_all(folder, CHAMFER, HOW, out) == rows
+
+
+def test_what_no_one_foresaw_costs_a_class_one_student(tmp_path, monkeypatch):
+    for name in ("Ann", "Bo", "Cy"):
+        (tmp_path / "class" / name).mkdir(parents=True)
+
+    def found(path, name):
+        if path.name == "Cy":
+            raise RecursionError("too deep")
+        return path.name.encode(), "", 1
+
+    def mark(content):
+        if content == b"Bo":
+            raise KeyError("ours")
+        return grading.Mark(1.0, "Right.", "limits")
+    monkeypatch.setattr(grading, "find_submission", found)
+    monkeypatch.setattr(grading, "items_of", lambda *_: [grading.Item("2.5 f", 5, mark)])
+    rows = grading.grade_all(tmp_path / "class", CHAMFER, HOW, tmp_path / "grades.csv")
+    assert [(row["score"], row["note"]) for row in rows] == [(5, ""), (0, "NOT GRADED: 'ours'"), (0, "too deep")]
 
 
 def test_a_seed_is_a_number_or_a_file_that_not_everybody_reads(tmp_path):
@@ -334,13 +391,15 @@ REFUSED = [([], "either a submission"), (["a", "--all", "b"], "either a submissi
            (["--all", "b", "--csv", "c"], "--assignment"), (["nothing.py"], "--assignment"),
            (["nothing", "--assignment", "9"], "assignment: expected"),
            (["setup.cfg", "--assignment", "2", "--task", "x"], "no task x"),
-           (["--all", "b", "--csv", "{}/c.csv", "--assignment", "2"], "no such folder b")]
+           (["--all", "b", "--csv", "{}/c.csv", "--assignment", "2"], "no such folder b"),
+           (["--all", "b", "--csv", "b/c.csv", "--assignment", "2"], "outside of b"),
+           (["a", "--assignment", "8"], "--pokes"), (["a", "--assignment", "2", "--out", "a/chamfer.py"], "--out")]
 
 
 @pytest.mark.parametrize("arguments, words", REFUSED)
 def test_the_command_says_in_one_line_what_it_cannot_do(arguments, words, tmp_path, capsys):
     arguments = [each.format(tmp_path) for each in arguments]
-    assert main(["grade", *arguments, "--out", str(tmp_path / "results.json")]) == 2
+    assert main(["grade", "--out", str(tmp_path / "results.json"), *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
 

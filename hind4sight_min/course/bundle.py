@@ -13,7 +13,7 @@ from ..disk.files import whole_file
 from ..lab.cli import data_small
 
 PACKAGE = Path(__file__).resolve().parents[1]
-NOT_NEEDED = "pybullet", "matplotlib"  # to simulate and to draw
+NOT_NEEDED = ("pybullet",)  # to simulate; students leave `import matplotlib` in
 
 SETUP = """#!/bin/bash
 # Once, when the container is built. AUTOGRADER: the folder of it all.

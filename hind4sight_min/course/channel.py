@@ -79,7 +79,5 @@ def decode(contents):
         arrays = [load_npy(content) for content in contents[1:]]
         return json.loads(bytes(contents[0]),
                           object_hook=lambda each: arrays[each["npy"]] if [*each] == ["npy"] else each)
-    except MemoryError:
-        raise
-    except Exception as error:  # damage can surface as almost anything: struct, JSON, NumPy, too deep a nesting
+    except Exception as error:  # damage can surface as almost anything: struct, JSON, MemoryError for a deep nesting
         raise ValueError(f"message: {error or type(error).__name__}") from None

@@ -6,30 +6,42 @@ import stat
 from pathlib import Path
 
 from ..disk.files import write_text
-from . import ASSIGNMENTS, assignment_of, grading
+from . import ASSIGNMENTS, assignment_of, grading, sandbox
 
 
 def run_grade(args):
     """Grade one submission, or with --all a folder of them."""
     if (args.folder is None) == (args.all is None) or (args.all is None) != (args.csv is None):
         raise ValueError("grade: expected either a submission, or --all FOLDER and --csv FILE")
+    if Path(args.out).suffix != ".json":
+        raise ValueError(f"--out: expected a file .json, got {args.out}")
     if args.all is None:
         assignment = assignment_of(args.assignment) if args.assignment else assignment_in(args.folder)
+        expect_pokes(assignment, args)
         how = grading.How(None if args.public else seed_from(args.seed), pokes=args.pokes)
         content, note = None, ""
         try:
             content, _, _ = grading.find_submission(args.folder, f"{assignment.name}.py")
-        except ValueError as error:
-            note = str(error)
+        except Exception as error:  # whatever it is, results.json says so
+            note = sandbox.one_line(error)
         results = grading.grade(grading.items_of(assignment, how), content, args.out, args.task, note)
         print(grading.table(results))
         return
     if not args.assignment or args.task or args.public:
         raise ValueError("grade --all: expected --assignment N, and neither --task nor --public")
+    if Path(args.csv).resolve().is_relative_to(Path(args.all).resolve()):
+        raise ValueError(f"--csv: expected a file outside of {args.all}, where what lies beside it is a student's")
+    expect_pokes(assignment_of(args.assignment), args)
     seed = args.seed or kept_seed(grading.results_folder(args.csv) / "seed")
     how = grading.How(seed_from(seed), pokes=args.pokes)
     rows = grading.grade_all(args.all, assignment_of(args.assignment), how, args.csv, args.jobs, print_row)
     print(f"{args.csv}: {len(rows)} students")
+
+
+def expect_pokes(assignment, args):
+    """Raises ValueError where assignment 8 would be scored on pokes that students have."""
+    if assignment.name == "improve" and not (args.pokes or args.public):
+        raise ValueError("--pokes: expected pokes that students do not have, `collect` makes some; or --public")
 
 
 def print_row(row, results):
@@ -69,6 +81,6 @@ def seed_from(text):
 def kept_seed(path):
     """A file with a seed, drawn when there is none yet, so that a class goes on with the inputs it began with."""
     if not path.is_file():
-        path.touch(mode=0o600)
-        path.write_text(secrets.token_hex(16))
+        write_text(path, secrets.token_hex(16))  # never an empty one
+        path.chmod(0o600)
     return path

@@ -9,15 +9,18 @@ import csv
 import hashlib
 import io
 import json
+import os
 import random
 import re
 import stat
 import threading
+import tokenize
 import zipfile
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +37,8 @@ MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the f
 
 def in_order(text):
     """A key that sorts names as people count: attempt 2 before attempt 10. Not in the paper: grading."""
-    return [(int(each), "") if each.isdigit() else (0, each) for each in re.split(r"(\d+)", str(text).lower())]
+    pieces = [each.lstrip("0") if each.isdecimal() else each for each in re.split(r"(\d+)", str(text).lower())]
+    return [(len(each) * each.isdecimal(), each) for each in pieces]  # as numbers they may be too long for int
 
 
 def find_submission(path, name):
@@ -64,7 +68,8 @@ def find_submission(path, name):
 
 
 def as_utf8(content):
-    """Source text in UTF-8, whatever an editor saved it in: also UTF-16 with its mark, and else Latin-1.
+    """Source text in UTF-8, whatever an editor saved it in: also UTF-16 with its mark, and else Latin-1; as it is where
+    it says in a comment, `# coding: gbk`, what it is in.
 
     Not in the paper: grading. Raises ValueError for null bytes in it.
     """
@@ -73,8 +78,9 @@ def as_utf8(content):
     if b"\0" in content:
         raise ValueError("there are null bytes in it: save it as plain text")
     try:
-        content.decode()
-    except UnicodeDecodeError:
+        if tokenize.detect_encoding(io.BytesIO(content).readline)[0] in ("utf-8", "utf-8-sig"):
+            content.decode()
+    except (SyntaxError, UnicodeDecodeError):  # SyntaxError: already in its first lines
         content = content.decode("latin-1").encode()
     return content
 
@@ -92,17 +98,21 @@ def read_zip(path, name):
     path = Path(path)
     if path.stat().st_size > MOST_ZIP:
         raise ValueError(f"{path.name} has {path.stat().st_size >> 20} MB, at most {MOST_ZIP >> 20} MB are read")
+    if path.read_bytes().count(b"PK\1\2") > 2 * MOST_MEMBERS:  # before zipfile makes an object of each
+        raise ValueError(f"{path.name}: more than {MOST_MEMBERS} files in it")
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
+            for each in members:
+                each.filename = each.filename.replace("\\", "/")  # as some Windows programs write it
             if len(members) > MOST_MEMBERS or sum(each.file_size for each in members) > MOST_ZIP:
                 raise ValueError(f"{path.name}: more than {MOST_MEMBERS} files or {MOST_ZIP >> 20} MB in it")
             for each in members:
-                parts = each.filename.replace("\\", "/").split("/")
-                if ".." in parts or parts[0] == "" or ":" in parts[0] or stat.S_ISLNK(each.external_attr >> 16):
+                parts = each.filename.split("/")
+                if ".." in parts or parts[0] == "" or parts[0][1:2] == ":" or stat.S_ISLNK(each.external_attr >> 16):
                     raise ValueError(f"{path.name}: refused, for {each.filename!r} in it leads out of its folder")
             found = sorted((each for each in members if Path(each.filename).name == name
-                            and not ignored(each.filename)), key=lambda each: in_order(each.filename))
+                            and not each.is_dir() and not ignored(each.filename)), key=lambda each: in_order(each.filename))
             if not found:
                 raise ValueError(f"{path.name}: there is no {name} in it")
             with archive.open(found[-1]) as file:
@@ -163,7 +173,7 @@ def mark_task(assignment, task, how, content):
         if how.seed is not None:
             answers[1:] = [replace(each, error=quiet(each.error)) for each in answers[1:]]
         verdict = judge(task, cases, answers)
-    except MemoryError:
+    except (MemoryError, RuntimeError):  # ours: the reference itself fails
         raise
     except Exception as error:  # answers of a form that no honest answer has
         return Mark(0.0, f"What came back is no answer ({type(error).__name__}).", outcome.isolation)
@@ -205,24 +215,27 @@ def printed(outcome, how):
 
 
 def mark_bug(assignment, number, how, content):
-    """Grade one measurement of assignment 7 -> Mark, on the right package and on the mutant, in random order.
+    """Grade one measurement of assignment 7 -> Mark, on the right package and on the mutant, one of them twice.
 
-    Not in the paper: grading.
+    Not in the paper: grading. The order is drawn, and so is that in which the packages are made: the clock, or the age
+    of a file, would tell them apart. Tossing a coin succeeds in one case of eight.
     """
-    found, file = {}, f"{assignment.name}.py"
-    for which in random.sample((0, number), 2):
+    for which in random.sample(range(len(bugs.MUTANTS) + 1), len(bugs.MUTANTS) + 1):
+        blank.package_for(which)
+    found, file = {0: [], number: []}, f"{assignment.name}.py"
+    for which in random.sample((0, number, random.choice((0, number))), 3):
         outcome = sandbox.run(blank.package_for(which), {
             "kind": "bug", "files": {file: content}, "file": file, "number": number},
             how.limits or sandbox.Limits(), how.namespaces)
-        found[which] = outcome.failure or measured(outcome.answer)
-    verdict = bugs.judge(number, found[0], found[number])
+        found[which].append(outcome.failure or measured(outcome.answer))
+    verdict = min((bugs.judge(number, *pair) for pair in product(found[0], found[number])), key=lambda each: each.share)
     return Mark(verdict.share, sandbox.one_line(verdict.sentence) or "Right.", outcome.isolation)
 
 
 def measured(answer):
     """Three numbers, or a str that says what went wrong: all that `bugs.judge` is to be given."""
-    if isinstance(answer, list) and len(answer) == 3 and all(isinstance(each, (int, float)) for each in answer):
-        return tuple(float(each) for each in answer)
+    if isinstance(answer, list) and [type(each) for each in answer] == [float] * 3:
+        return tuple(answer)
     return answer if isinstance(answer, str) else "what came back is no answer"
 
 
@@ -329,6 +342,12 @@ def results_folder(out):
     return folder
 
 
+def as_cell(text):
+    """Text for a CSV file and a terminal: printable, and no formula to a spreadsheet. Not in the paper: grading."""
+    text = "".join(each if each.isprintable() else "?" for each in text)
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+
+
 def write_csv(path, rows):
     """Write dicts of the same keys as a CSV file, whole or not at all."""
     text = io.StringIO()
@@ -355,25 +374,26 @@ def grade_all(folder, assignment, how, out, jobs=2, on_student=None):
             content, where, inside = find_submission(waiting[name][-1], f"{assignment.name}.py")
             attempts += inside - 1
             key = hashlib.sha256(f"{assignment.number} {how.seed} {how.pokes}\n".encode() + content).hexdigest()[:20]
-        except (ValueError, OSError) as error:
-            note, key = sandbox.one_line(error), hashlib.sha256(name.encode()).hexdigest()[:20]
+        except Exception as error:  # also a folder too deep to walk through
+            note, key = sandbox.one_line(error), hashlib.sha256(os.fsencode(name)).hexdigest()[:20]
         path = kept / f"{key}.json"
         with locks[key]:
             results = json.loads(path.read_text()) if content is not None and path.is_file() else None
             if not (results and results["extra_data"]["finished"]):
                 try:
                     results = grade(items, content, path, note=note)
-                except RuntimeError as error:  # the sandbox could not even begin: this is not the student's fault
+                except Exception as error:  # ours, as where the sandbox could not begin: not the student's fault
                     note, results = f"NOT GRADED: {error}", json.loads(path.read_text())
-        row = {"student": name, "score": results["score"], "of": total_of(results), "attempts": attempts,
-               "file": where, "note": note, "results": path.name,
+        row = {"student": as_cell(name), "score": results["score"], "of": total_of(results), "attempts": attempts,
+               "file": as_cell(where), "note": as_cell(note), "results": path.name,
                **{test["name"].split()[0]: test["score"] for test in results["tests"]}}
         return row, results
 
     with ThreadPoolExecutor(jobs) as pool:
-        for done in as_completed([pool.submit(one, name) for name in waiting]):
+        running = {pool.submit(one, name): name for name in waiting}
+        for done in as_completed(running):
             row, results = done.result()
-            rows[row["student"]] = row
+            rows[running[done]] = row
             write_csv(out, [rows[name] for name in waiting if name in rows])
             places += [{"student": row["student"], each["name"]: each["value"]}
                        for each in results.get("leaderboard", ())]

@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import threading
 import time
@@ -29,6 +30,7 @@ from . import channel
 
 WORKER = Path(__file__).with_name("worker.py")
 PACKAGE = Path(__file__).resolve().parents[1]
+HIDDEN = PACKAGE, Path(sysconfig.get_path("data"), "share", "hind4sight_min")  # the second: the shipped pokes' truth
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def temporary_folder(user):
 
 
 def surroundings(package):
-    """What a student's process sees of the disk, and what of that it does not: this very package."""
+    """What a student's process sees of the disk, and what of that it does not: this very package and its data."""
     libraries = sorted({str(Path(find_spec(name).origin).parents[1])
                         for name in ("numpy", "scipy", "cv2", "autograd")})
     paths = ["/usr", "/lib", "/lib64", "/bin", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", sys.base_prefix,
@@ -205,5 +207,6 @@ def surroundings(package):
     for path in paths:
         if os.path.exists(path) and not any(Path(path).is_relative_to(other) for other in visible):
             visible.append(path)
-    hidden = [str(PACKAGE)] if any(PACKAGE.is_relative_to(path) for path in visible) else []
+    hidden = [str(folder) for folder in HIDDEN
+              if folder.is_dir() and any(folder.is_relative_to(path) for path in visible)]
     return {"visible": visible, "hidden": hidden, "libraries": libraries}
