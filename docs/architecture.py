@@ -2,7 +2,8 @@
 
     python docs/architecture.py [--out docs/architecture.png]
 
-The shapes are measured on the first shipped training poke; a name that is not in the code ends the script.
+The shapes are measured on the second shipped test poke, that of lessons 00, 08 and 09; a name that is not in the code
+ends the script.
 """
 import argparse
 import importlib
@@ -23,26 +24,26 @@ INPUT, FORWARD, INVERSE, LOSS = "0.92", *(0.65 + 0.35 * PALETTE[[1, 2, 0]])
 
 # name -> (x, y of the middle, what stands in the box, colour)
 BOXES = {
-    "seen": (0, 6.6, "before:\ndepth, $I_t$", INPUT),
+    "seen": (-0.3, 6.6, "before:\ndepth, $I_t$", INPUT),
     "scene": (3.2, 6.6, "scene.scene_of\npoints, objects", INPUT),
-    "look": (6.7, 6.6, "scene.look\nwhat stands out\nnear the poke", INPUT),
-    "poke": (6.7, 9.2, "poke $u_t$", INPUT),
+    "look": (6.95, 6.6, "scene.look\nwhat stands out\nnear the poke", INPUT),
+    "poke": (6.95, 9.2, "poke $u_t$", INPUT),
     "local": (10.4, 9.2, "geometry.poke_frame\nnetworks.poke_features", FORWARD),
-    "map": (14.8, 9.6, "networks.height_map", FORWARD),
+    "map": (14.8, 9.6, "networks.height_map\nnetworks.first_met", FORWARD),
     "encode": (10.4, 6.6, "networks.encode\nsiamese encoder", FORWARD),
     "trunk": (14.8, 7.7, "networks.forward_model\ntrunk and context", FORWARD),
     "masks": (18.9, 6.6, "networks.softmax\nmasks $m^k$", FORWARD),
     "motions": (18.9, 9.2, "networks._motions\ngeometry.so3_exp", FORWARD),
-    "eq1": (23.9, 7.7, "geometry.transform_layer\nEq. (1)", FORWARD),
-    "flow": (23.9, 5.7, "geometry.optical_flow\nprojection layer", FORWARD),
-    "after": (0, 2.2, "after:\ndepth, $I_{t+1}$", INPUT),
+    "eq1": (23.4, 7.7, "geometry.transform_layer\nEq. (1)", FORWARD),
+    "flow": (23.4, 5.7, "geometry.optical_flow\nprojection layer", FORWARD),
+    "after": (-0.3, 2.2, "after:\ndepth, $I_{t+1}$", INPUT),
     "scene2": (3.2, 2.2, "scene.scene_of\npoints, objects", INPUT),
-    "changed": (6.4, 4.0, "scene.most_changed\nof whole pictures", INVERSE),
-    "inverse": (12.3, 4.0, "networks.inverse_model", INVERSE),
-    "embed": (11.8, 2.2, "networks.state_embedding\nof $P'_{t+1}$ and $P_{t+1}$", INVERSE),
+    "changed": (6.3, 4.0, "scene.most_changed\nof whole pictures", INVERSE),
+    "inverse": (11.9, 4.0, "networks.inverse_model", INVERSE),
+    "embed": (11.9, 2.2, "networks.state_embedding\nof $P'_{t+1}$ and $P_{t+1}$", INVERSE),
     "linv": (16.2, 3.2, "losses.inverse_loss\n$L_{act} + L_{sim}$", LOSS),
     "eq3": (23.4, 3.5, "losses.photometric_loss  Eq. (3)\nlosses.flow_smoothness_loss  Eq. (4)", LOSS),
-    "binary": (19.8, 4.6, "losses.binary_mask_loss", LOSS),
+    "binary": (19.4, 4.7, "losses.binary_mask_loss", LOSS),
     "eq25": (23.4, 1.4, "losses.chamfer_loss  Eq. (2)\nlosses.distance_smoothness_loss  Eq. (5)", LOSS),
     "eq6": (16.6, 0.9, "losses.full_loss\nEq. (6)", LOSS),
     "step": (12.6, 0.5, "training.adam\nor training.muon", LOSS),
@@ -58,15 +59,16 @@ ARROWS = (("seen", "scene", "depth"), ("scene", "look", "points"), ("look", "enc
           ("inverse", "linv", "heatmaps"), ("embed", "linv", "embedding"), ("linv", "eq6", "term"),
           ("eq3", "eq6", "term"), ("masks", "binary", "masks"), ("binary", "eq6", "term"), ("eq25", "eq6", "term"),
           ("eq6", "step", "gradient"))
-NOTES = ((23.4, 2.75, "with the images $I_t$, $I_{t+1}$"), (23.4, 0.65, "of $P'_{t+1}$ and $P_{t+1}$, with both images"))
+NOTES = ((23.4, 2.75, "with the images $I_t$, $I_{t+1}$"),
+         (23.4, 0.65, "of $P'_{t+1}$ and $P_{t+1}$, with both images"))
 
 
 def measured_shapes():
     """What goes along the arrows, for one poke -> {key: text}."""
-    data = load_interactions(ROOT / "data_small" / "train")[[0]]
+    data = load_interactions(ROOT / "data_small" / "test")[[1]]
     run = training.start_run(training.Recipe(), data)
     before, after = training.scenes_of(data)
-    rows, _ = scene.look(before, data.pokes)
+    rows, seen = scene.look(before, data.pokes)
     looked = before.points[0][rows]
     found = networks.predict(run.params, run.recipe.sizes, before, data.pokes)
     evidence = scene.most_changed(before, after)
@@ -78,7 +80,7 @@ def measured_shapes():
     return {
         "depth": text(data.depth_before) + " m", "points": text(before.points) + " m", "looked": text(looked),
         "poke": text(data.pokes), "local": text(local), "features": text(networks.poke_features(local)),
-        "map": text(networks.height_map(local, np.ones(local.shape[:2], bool))),
+        "map": text(networks.height_map(local, seen), networks.first_met(local, seen)),
         "encoded": text(networks.encode(run.params, looked)), "trunk": f"({looked.shape[1]}, {sizes.width})",
         "masks": f"({looked.shape[1]}, {sizes.masks})", "motions": text(found.rotations, found.translations),
         "flow": str((*before.images.shape[1:3], 2)) + " px", "changed": text(*evidence),
@@ -97,7 +99,7 @@ def check_names():
                 getattr(importlib.import_module(f"hind4sight_min.{module}"), name)
 
 
-WHOLE = (-1.3, 26.4, -0.1, 11.3)
+WHOLE = (-1.6, 26.7, -0.1, 11.3)
 
 
 def draw(view=WHOLE, badges=None):
@@ -138,10 +140,12 @@ def draw(view=WHOLE, badges=None):
         axes.text(x + 0.15, y, text, fontsize=9, color="0.3", ha="center")
     if view != WHOLE:
         return figure
-    axes.text(-1, 10.85, "One poke through the model: functions of hind4sight_min in the boxes, shapes on the arrows (of one "
-              "poke; everything has a batch axis B before it).", fontsize=13)
-    axes.text(-1, 10.4, "64 x 48 pixels are 3,072 points; 116 of this poke's stand out near its end. Grey: what is seen. "
-              "Blue: forward model. Green: inverse model. Orange: losses.", fontsize=11)
+    axes.text(-1.3, 10.85, "One poke through the model: functions of hind4sight_min in the boxes, shapes on the arrows "
+              "(of one poke; everything has a batch axis B before it).", fontsize=13)
+    count = shapes["looked"].partition(",")[0][1:]
+    axes.text(-1.3, 10.4, f"64 x 48 pixels are 3,072 points; the model looks at {count} of them, which stand out near "
+              "this poke's end. Grey: what is seen. Blue: forward model. Green: inverse model. Orange: losses.",
+              fontsize=11)
     return figure
 
 

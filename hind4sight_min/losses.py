@@ -3,7 +3,7 @@
 Shapes: B interactions, H, W the picture, N = H * W points, row by row, so a map (B, N) is a picture (B, H, W).
 Every term returns (B,), per interaction: the sum over pixels as printed in the paper (L_sim: a mean); `full_loss`
 averages over the batch. `valid` (B, N) marks the pixels that count: the others neither attract nor cost anything. In
-training these are the pixels with depth that both frames show (`seen_in_both`); flow is smooth wherever there is depth.
+training these are the pixels with depth that both frames show (`seen_in_both`), but in Eq. 4 all that have depth.
 """
 from functools import lru_cache
 
@@ -156,7 +156,7 @@ def heatmap_cross_entropy(logits, cells):
 def embedding_loss(predicted, observed):
     """L1 distance of the predicted and the observed next state's embedding. Paper: L_sim, Sec. III-E.
 
-    (B, E), (B, E) -> (B,), the mean over E, so that its weight does not depend on the embedding's width.
+    (B, E), (B, E) -> (B,), the mean over E, not the sum. What it trains and what not: `networks.state_embedding`.
     """
     # Not anp.mean: under NumPy 2 autograd's derivative of it turns float32 into float64.
     return anp.sum(anp.abs(predicted - observed), axis=1) / float(predicted.shape[1])

@@ -168,8 +168,8 @@ def forward_model(params, sizes, points, valid, pokes):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
     points (B, M, 3) m arena, a set, those that `scene.look` found; valid (B, M) bool, which of them count; pokes
-    (B, 3), (m, m, rad) -> Prediction of these points. The poke enters only as the frame that everything is seen in, x
-    along it and its target the origin: where the finger came down is not told, as in the paper's u_t.
+    (B, 3), (m, m, rad) -> Prediction of these points. The poke enters only as a frame, x along it and its target the
+    origin, that all but the encoder sees points in: where the finger came down is not told, as in the paper's u_t.
     """
     local = poke_frame(points, pokes)
     met = first_met(local, valid)[:, None]

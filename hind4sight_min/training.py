@@ -89,7 +89,7 @@ def scenes_of(interactions):
 
 
 def loss_terms(params, sizes, batch, camera, wanted=WEIGHTS):
-    """The terms of Eq. (6) that are wanted -> dict of (B,); what an ablation leaves out takes no time."""
+    """The terms of Eq. (6), and `binary_masks`, that are wanted -> dict of (B,); what is left out takes no time."""
     before, after, terms = batch.before, batch.after, {}
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     prediction = predict(params, sizes, before, batch.pokes)

@@ -52,11 +52,8 @@ def test_each_assignment_has_four_to_six_tasks_and_a_hundred_points():
 
 @pytest.mark.parametrize("assignment", CARVED, ids=lambda each: each.name)
 def test_the_theory_points_to_what_there_is(assignment):
-    source = assignment.theory.rpartition("Paper: ")[2]
-    tutorials, pages = re.findall(r"`(\w+)`", source), re.findall(r"docs/\w+\.md", source)
-    assert tutorials or pages
-    assert all(list((ROOT / "tutorials").glob(f"[0-9]*_{name}.py")) for name in tutorials), tutorials
-    assert all((ROOT / page).is_file() for page in pages), pages
+    lessons = re.findall(r"tutorials/\w+\.py", assignment.theory.rpartition("Paper: ")[2])
+    assert lessons and all((ROOT / lesson).is_file() for lesson in lessons), lessons
 
 
 def test_where_the_reference_fails_no_student_is_blamed():

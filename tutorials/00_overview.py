@@ -104,8 +104,8 @@ lesson.keep(options, architecture.draw(badges={box: " ".join(numbers) for box, n
 #     B, H, W, N, K              pokes, rows and columns of a picture, points (H W), masks
 #
 # A prime means "predicted, or made from what is predicted". Points that are *valid* have a depth; *occupied* ones
-# belong to something that stands in the arena. Here is one of each, computed by the shipped model for a poke that it
-# was not trained on.
+# belong to something that stands in the arena. Here is what the symbols are for one poke that the shipped model was not
+# trained on.
 
 # %%
 pokes, _ = lesson.pokes()

@@ -115,11 +115,12 @@ def slopes(loss, x, h=1e-5):
     found = np.zeros(x.shape)
     for k in np.ndindex(*x.shape):
         usual = x[k]
-        values = []
-        for x[k] in (usual + h, usual - h):
-            values.append(loss())
+        x[k] = usual + h
+        above = loss()
+        x[k] = usual - h
+        below = loss()
         x[k] = usual
-        found[k] = (values[0] - values[1]) / (2 * h)
+        found[k] = (above - below) / (2 * h)
     return found
 
 

@@ -6,7 +6,7 @@ has learnt anything?
 Equations:
 - Not in the paper, where the model looks and what the finger meets: `scene.look`, `networks.first_met`,
   `networks.height_map`; tests/test_scene.py, tests/test_networks.py
-- Sec. III-A, a poke as the frame of all features: `geometry.poke_frame`, `networks.poke_features`;
+- Sec. III-A, the poke as a frame: `geometry.poke_frame`, `networks.poke_features`;
   tests/test_geometry.py, tests/test_networks.py
 - Sec. III-E and III-G, the siamese encoder and the state embedding: `networks.encode`, `networks.state_embedding`;
   tests/test_networks.py
@@ -52,8 +52,8 @@ print(f"1. {sum(count.values())} parameters in {len(count)} arrays, {each_point}
 # ## The way through the network
 #
 # The upper half of docs/architecture.md: from the cloud (left) and the poke to the predicted cloud and its optical flow
-# (right). The numbers along the arrows are shapes: 116 points of one poke enter with 3 coordinates each, and leave with
-# 3 masks each. What is narrow runs on every point, what is wide once per poke or mask.
+# (right). The numbers along the arrows are shapes: 105 points of one poke enter with 3 coordinates each, and leave with
+# 3 masks each.
 
 # %%
 lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "architecture", dpi=85)
@@ -70,9 +70,9 @@ lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "a
 # share its parameters. The sum of its features over the points of objects is the *state embedding* s_t
 # (`networks.state_embedding`); that of the predicted cloud P'_{t+1} is to be like that of the observed one, P_{t+1}.
 #
-# What tells the points about each other is *context*: the maximum and weighted sums of a layer's features over the
-# whole cloud, handed back to every point. Neither a maximum nor a sum minds an order. So a shuffled cloud must give the
-# same answer, shuffled.
+# What tells the points about each other is *context*: the maximum and a weighted sum of a layer's features over all
+# points that it looks at, handed back to every point. Neither a maximum nor a sum minds an order. So a shuffled cloud
+# must give the same answer, shuffled.
 #
 # Most of a picture is table that stays. So the model looks only at points that stand out from the empty arena, or lie
 # next to one that does, and of those only at the ones in a box around where the poke ends, 14 cm to each side
@@ -80,7 +80,8 @@ lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "a
 # `networks.predict` asks the *forward model* about these points and puts its answer back among the others.
 #
 # What a finger does to an object depends on where it meets it, which a perceptron learns slowly from coordinates:
-# `networks.first_met` says it, in weights over the points. `networks.height_map` says what stands around the target.
+# `networks.first_met` says it, in weights over the points, those of the sum above. `networks.height_map` says what
+# stands around the target, and is part of the context too.
 
 # %%
 ROW = 1
@@ -103,9 +104,9 @@ print(f"2. The model looks at {seen.sum()} points of {before.points.shape[1]}; s
 #
 #     P'_{t+1} = sum_k m^k (R_k P_t + T_k)
 #
-# Motion 0 is the background's and always "stay". Everything is said in the *poke's frame*, in which the target is
-# the origin and the poke goes along x. Sec. III-G starts with mask 0 ahead of the others and with motions that are
-# the identity.
+# Motion 0 is the background's and always "stay". All but the encoder's features is said in the *poke's frame*, in which
+# the target is the origin and the poke goes along x. Sec. III-G starts with mask 0 ahead of the others and with motions
+# that are the identity.
 #
 # **Predict before you run:** in the fresh network the background's logit is 0 and that of each of the two movers about
 # -1, at every point. What share of a point does the background get? And how far does this network move anything?
@@ -150,8 +151,8 @@ lesson.keep(options, figure, "masks")
 # %% [markdown]
 # ## What if?
 #
-# Here is one scene and four pokes that nobody carried out,
-# one at each object. The network never had a list of objects. What it calls an object is what moves together.
+# Here is one scene and four pokes that nobody carried out, one at each object. The network never had a list of objects.
+# What it calls an object is what moves together.
 #
 # **Predict before you run:** one scene, four pokes: are the masks the same four times, because the objects are?
 
@@ -231,6 +232,7 @@ lesson.end(options)
 # %% [markdown]
 # ## Answers
 #
-# 1. A little more than half: e^0 / (e^0 + 2 e^-1) = 0.58. Not all of it: a mask of nothing could not learn, for
-#    whatever its motion does, nothing changes. It moves nothing, as all its motions are the identity.
+# 1. A little more than half: e^0 / (e^0 + 2 e^-1) = 0.58 (0.57, as logits are bounded). Not all of it: a mask of
+#    nothing could not learn, for whatever its motion does, nothing changes. It moves nothing, as all its motions are
+#    the identity.
 # 2. No. The masks are a function of the cloud *and of the poke*: they say what this poke will move.

@@ -50,9 +50,10 @@ ROW = 1
 #
 # The *inverse model* (Sec. III-E) sees both clouds and answers with two *heat-maps*, probabilities over the cells
 # of the arena's grid: where the finger started, and its target. `scene.most_changed` picks the points that
-# changed most; everything is said relative to their centre, so that a poke learnt in one corner is known in all.
-# The loss of a heat-map, L_act, is its cross entropy: minus the logarithm of the probability at the true cell.
-# The other half of the inverse loss, L_sim, wants the state embedding of P'_{t+1} to be that of P_{t+1}.
+# changed most; all but the encoder's features is said relative to their centre, so that a poke learnt in one corner is
+# known in all. The first half of the inverse loss, L_act, is the sum of both heat-maps' cross entropies, and a cross
+# entropy is minus the logarithm of the probability at the true cell. The other half, L_sim, wants the state embedding
+# of P'_{t+1} to be that of P_{t+1}.
 #
 # **Predict before you run:** there are 400 cells. What does a heat-map cost that knows nothing? And which of the two
 # will be the harder to tell, the start or the target?
@@ -137,10 +138,11 @@ for step, norms in first.items():
 # %% [markdown]
 # ## How hard does each term pull?
 #
-# Eq. (6) adds up five terms, each with a weight lambda. It is tempting to choose the weights so that the weighted
-# *values* are alike. But a network is moved by gradients. We compare, at the shipped parameters: a term's weighted
-# value, the norm of its weighted gradient for one poke (median), and that of the mean gradient over the pokes. The mean
-# is what moves the network; where it is far smaller than a single poke's, the pokes disagree.
+# Eq. (6) adds up five terms, each with its weight; here a sixth joins them, a price on points that are half background
+# (`losses.binary_mask_loss`). It is tempting to choose the weights so that the weighted *values* are alike. But a
+# network is moved by gradients. We compare, at the shipped parameters: a term's weighted value, the norm of its
+# weighted gradient for one poke (median), and that of the mean gradient over the pokes. The mean is what moves the
+# network; where it is far smaller than a single poke's, the pokes disagree.
 
 # %%
 AUDITED = 6 if options.quick else 24
@@ -169,7 +171,7 @@ for i, (label, colour) in enumerate((("value", PALETTE[2]), ("one poke's gradien
     right.bar(np.arange(len(audit)) + 0.27 * (i - 1), [values[i] for values in audit.values()], 0.27, color=colour,
               label=label)
 right.set(yscale="log", ylim=(0.01, 3e3), ylabel="times the weight")
-right.set_xticks(range(len(audit)), [name.replace("_", "\n") for name in audit])
+right.set_xticks(range(len(audit)), [name.replace("_", "\n") for name in audit], fontsize=8)
 right.set_title("What a term costs, and how hard it pulls", fontsize=11)
 right.legend(fontsize=9, loc="upper right")
 figure.suptitle("Which layer learns first, and which term pulls hardest", fontsize=11)

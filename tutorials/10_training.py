@@ -203,7 +203,7 @@ lesson.keep(options, figure, "kink")
 # %% [markdown]
 # ## Train, and look on
 #
-# `training.train` calls us back after every step, with the means of the terms of Eq. (6) over its batch. After every
+# `training.train` calls us back after every step, with the means of the loss terms over its batch. After every
 # few steps we keep what the model says of two held-out pokes, to draw later; after every epoch we measure it on more of
 # them:
 #
@@ -272,10 +272,11 @@ step, ratio, on, off, iou = np.array(measurements).T  # each (epochs + 1,)
 # %% [markdown]
 # ## The losses, and what they never saw
 #
-# For each term of Eq. (6) the mean over each epoch, and a dotted line: what no motion costs. A fresh network
-# predicts no motion, so its terms are these lines. (Of the inverse loss it is what two uniform heat-maps cost, twice
-# log 400, and the distance between the state embeddings before and after.) Flow smoothness goes the other way. No
-# motion is perfectly smooth; to move anything at all costs something.
+# For each term the mean over each epoch, and a dotted line: what no motion costs. A fresh network predicts no motion,
+# so its terms are these lines. (Of the inverse loss it is what two uniform heat-maps cost, twice log 400, and the
+# distance between the state embeddings before and after.) Flow smoothness goes the other way. No motion is perfectly
+# smooth; to move anything at all costs something. The sixth term, *binary masks*, is not the paper's: it is a price on
+# points that are half background, half mover (`losses.binary_mask_loss`), and its line is what fresh masks cost.
 
 # %%
 fresh = training.start_run(recipe, train)
@@ -291,26 +292,27 @@ print(f"   cover of moving / of still points: fresh {on[0] / off[0]:.1f}, at the
 for name, values in epochs.items():
     print(f"   {name}: no motion {level[name]:.3g}, first epoch {values[0]:.3g}, last {values[-1]:.3g}")
 
-figure, axes = plt.subplots(2, 4, figsize=(11, 5.2), layout="constrained")
+figure, axes = plt.subplots(3, 3, figsize=(11, 7.5), layout="constrained")
 for panel, (name, values) in zip(axes.flat, epochs.items()):
     panel.plot(epoch_end, values, ".-", color=PALETTE[5])
     panel.axhline(level[name], color="0.5", linestyle=":")
     panel.set_title(f"{name.replace('_', ' ')}\n{TERMS[name]}", fontsize=10)
     panel.set_ylim(0, 1.1 * max(*values, level[name]))
-axes.flat[5].plot(steps, rates, color=PALETTE[6])
-axes.flat[5].set_title("learning rate", fontsize=10)
-axes.flat[5].set_ylim(0, None)
-axes.flat[6].plot(step, ratio, ".-", color=PALETTE[5])
-axes.flat[6].axhline(1, color="0.5", linestyle=":")
-axes.flat[6].set_title("held-out: squared flow error\n/ no motion", fontsize=10)
-axes.flat[6].set_ylim(0, None)
-axes.flat[7].plot(step, on, ".-", color=PALETTE[6], label="cover, moving points")
-axes.flat[7].plot(step, off, ".-", color=PALETTE[1], label="cover, still points")
-axes.flat[7].plot(step, iou, ".-", color=PALETTE[2], label="IoU of the masks")
-axes.flat[7].set_title("held-out: masks\n(no loss asks for them)", fontsize=10)
-axes.flat[7].set_ylim(0, 1.5)
-axes.flat[7].legend(fontsize=8, loc="upper center")
-for panel in axes[1]:
+rate_panel, ratio_panel, masks_panel = axes[2]
+rate_panel.plot(steps, rates, color=PALETTE[6])
+rate_panel.set_title("learning rate", fontsize=10)
+rate_panel.set_ylim(0, None)
+ratio_panel.plot(step, ratio, ".-", color=PALETTE[5])
+ratio_panel.axhline(1, color="0.5", linestyle=":")
+ratio_panel.set_title("held-out: squared flow error\n/ no motion", fontsize=10)
+ratio_panel.set_ylim(0, None)
+masks_panel.plot(step, on, ".-", color=PALETTE[6], label="cover, moving points")
+masks_panel.plot(step, off, ".-", color=PALETTE[1], label="cover, still points")
+masks_panel.plot(step, iou, ".-", color=PALETTE[2], label="IoU of the masks")
+masks_panel.set_title("held-out: masks\n(no loss says where they shall be)", fontsize=10)
+masks_panel.set_ylim(0, 1.5)
+masks_panel.legend(fontsize=8, loc="upper center")
+for panel in axes[2]:
     panel.set_xlabel("step")
 figure.suptitle("The losses fall, most of them below what no motion costs (dotted); masks come with it",
                 fontsize=11)

@@ -210,7 +210,8 @@ def difference(found, expected, show=False):
     if found.shape != expected.shape:
         return f"expected shape {expected.shape}, got {found.shape}"
     if found.dtype != expected.dtype and (expected.dtype.kind == "f" or found.dtype.kind != expected.dtype.kind):
-        hint = " (a whole number or a float64 array beside it makes float64 of float32)" * (found.dtype == float)
+        hint = (" (a whole-number or float64 array beside it makes float64 of float32, and so do the derivatives of "
+                "anp.max and anp.mean)") * (found.dtype == float)
         return f"expected dtype {expected.dtype}, got {found.dtype}{hint}"
     strange = ~np.isfinite(found) & np.isfinite(expected)
     if strange.any():

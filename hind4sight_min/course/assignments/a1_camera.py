@@ -25,7 +25,7 @@ help, and so does a tiny number under the root.
 **The poke's frame.** The model sees everything from the poke u = (a_x, a_y, a_theta): origin at its target on the
 table, x along its direction, so that p_arena = Q p_poke + o, with Q a turn by a_theta about z.
 
-Paper: Sec. III-A (Eq. 1) and III-C; the tutorials `point_clouds` and `rigid_motion`.
+Paper: Sec. III-A (Eq. 1) and III-C; tutorials/01_point_clouds.py and tutorials/02_rigid_motion.py.
 """
 from dataclasses import replace
 
@@ -163,7 +163,8 @@ TASKS = (
                  lambda depth, camera: unproject(depth, replace(camera, fx=camera.fy, fy=camera.fx)),
              "The picture's middle instead of the principal point (cx, cy)":
                  lambda depth, camera: unproject(depth, replace(camera, cx=camera.width / 2, cy=camera.height / 2)),
-             "Depth is along the optical axis, not along each pixel's ray": along_the_ray}),
+             "Depth is along the optical axis, not along each pixel's ray": along_the_ray},
+         notes="Of the camera, intrinsics are fx, fy, cx, cy, and pose is arena_from_camera."),
     Task("1.2", "geometry.project", "Points to pixels, never infinite", 20, 20, point_cases, of_points,
          gradient=("points",), mistakes={
              "The points were not brought into the camera's frame":

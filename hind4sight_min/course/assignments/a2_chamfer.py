@@ -22,7 +22,7 @@ the neighbour changes when a point moves far enough is ignored: exact but where 
 **What only one frame shows** has no counterpart: an object covers table in frame t+1 that frame t shows, and uncovers
 other. A pixel counts unless it is table (valid, not occupied) where the *other* frame shows an object.
 
-Paper: Sec. III-B; the tutorial `chamfer`.
+Paper: Sec. III-B; tutorials/04_chamfer.py (03_derivative.py for the VJP).
 """
 import autograd.numpy as anp
 import numpy as np

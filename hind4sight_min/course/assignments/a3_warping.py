@@ -22,7 +22,7 @@ difference of the two columns, interpolated along y,
 and 0 outside. `cv2.remap` samples in one call, or write the four terms in NumPy: both count, and so the sampling is a
 primitive whose VJP with respect to the position is written by hand.
 
-Paper: Sec. III-C; the tutorial `warping`.
+Paper: Sec. III-C; tutorials/05_warping.py.
 """
 import autograd.numpy as anp
 import numpy as np

@@ -18,7 +18,7 @@ the image of its own grid.
 
     L = lambda_1 (L_CD + L_ds) + lambda_2 (L_rec + L_fs) + lambda_3 L_inv                                 Eq. (6)
 
-Paper: Sec. III-D and III-F; the tutorial `smoothness`.
+Paper: Sec. III-D and III-F; tutorials/06_smoothness.py.
 """
 from functools import partial
 
@@ -135,6 +135,8 @@ TASKS = (
              "Squared: the equation has the absolute value": smoothness(lambda step: step ** 2),
              "A step counts where both of its pixels are valid, not one of them":
                  smoothness(anp.abs, counts=np.logical_or),
+             "A step counts where both of its pixels are valid, not the first alone":
+                 smoothness(anp.abs, counts=lambda later, earlier: earlier),
              "Pixels that are not valid count":
                  lambda field, images, valid: edge_aware_smoothness(field, images, valid | True),
              "The weights of the picture's edges are missing":
@@ -153,6 +155,8 @@ TASKS = (
          map_cases, gradient=("map_predicted", "map_observed"), mistakes={
              "I_{t+1} for both maps, as printed in the paper: D_{P'->P} lives on frame t's grid":
                  with_maps(lambda now, later, valid, next_valid: (later, later, valid, next_valid)),
+             "Image and mask of frame t+1 for both maps: D_{P'->P} lives on frame t's grid":
+                 with_maps(lambda now, later, valid, next_valid: (later, later, next_valid, next_valid)),
              "I_t for both maps": with_maps(lambda now, later, valid, next_valid: (now, now, valid, next_valid)),
              "The two images are swapped": with_maps(lambda now, later, valid, next_valid: (
                  later, now, valid, next_valid)),
@@ -172,7 +176,8 @@ TASKS = (
                  lambda terms, weights: anp.sum(total(terms, weights)) / float(len(terms)),
              "The weights go with each other's terms: by name, not by position":
                  lambda terms, weights: full_loss(terms, dict(zip(weights, reversed(weights.values()))))},
-         notes="The terms are given by row here, in the order chamfer, distance_smoothness, photometric, "
-               "flow_smoothness, inverse; the last has no weight."),
+         notes="Here each row of terms is one of the dict's, its names being in this order chamfer, "
+               "distance_smoothness, photometric, flow_smoothness, inverse; those of the weights too. The last row has "
+               "no weight."),
 )
 TESTS = "eq4_flow_smoothness", "eq5_distance_smoothness", "eq6_full_loss"

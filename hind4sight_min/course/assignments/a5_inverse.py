@@ -7,10 +7,12 @@ arena's grid: where the finger came down, and where it went. It is trained with 
     L_act = -log softmax(z_start)[cell of the start] - log softmax(z_end)[cell of the end]
     L_sim = mean |s'_{t+1} - s_{t+1}|
 
-exp overflows for large logits; subtracting the largest of them changes nothing else. s_t is the state embedding, the
-sum of the encoder's features over the points of objects (times STATE_GAIN): s'_{t+1} that of the predicted cloud,
-s_{t+1} that of the observed one. L_sim moves the points. Where it measures, its gradient must stop: free to, the
-encoder would make L_sim small by saying nothing at all.
+exp overflows for large logits; subtracting the largest of them changes nothing else. Find it with `np.max(getval(z))`,
+for it cancels: autograd's derivatives of anp.max and anp.mean make float64 of float32, and need not be taken here.
+
+s_t is the state embedding, the sum of the encoder's features over the points of objects (times STATE_GAIN): s'_{t+1}
+that of the predicted cloud, s_{t+1} that of the observed one. L_sim moves the points. Where it measures, its gradient
+must stop: free to, the encoder would make L_sim small by saying nothing at all.
 
 **Cells** are counted row by row; rows run along y, columns along x; cell 0 is at the corner (-arena/2, -arena/2).
 
@@ -18,7 +20,7 @@ encoder would make L_sim small by saying nothing at all.
 less than PEAK around its centre is finer. The direction is that of the mean, over the start map, of the unit vectors
 from the cells' centres to the target.
 
-Paper: Sec. III-E; docs/architecture.md.
+Paper: Sec. III-E; tutorials/09_inverse_model.py.
 """
 import autograd.numpy as anp
 import numpy as np
@@ -174,7 +176,7 @@ TASKS = (
         "The sign is kept: where is |.|?": lambda p, o: anp.mean(p - o, axis=1),
         "The length of the difference (L2)": lambda p, o: anp.sqrt(anp.sum((p - o) ** 2, axis=1)),
         "No gradient to the observed state's embedding": lambda p, o: embedding_loss(p, getval(o))},
-         notes="autograd's derivative of anp.mean turns float32 into float64; divide anp.sum by a float."),
+         notes="Instead of anp.mean, whose derivative makes float64 of float32, divide anp.sum by a float."),
     Task("5.5", "networks.state_embedding", "The sum of features over the points of objects", 20, 25, state_cases,
          embedded, gradient=("points", "weights"), mistakes={
              "The gradient must stop at the encoder's weights":

@@ -19,7 +19,7 @@ objects are from the goal picture's, both in cm on the table, so that neither dr
     pixel_weight 100 mean_m max(|pixel_m - goal_m| pixel_size - SLACK, 0)
     + chamfer_weight 100 sqrt(mean_i min_j |P_i - G_j|^2 + mean_j min_i |P_i - G_j|^2)
 
-Paper: Sec. III-H and IV-G; the tutorial `planning`.
+Paper: Sec. III-H and IV-G; tutorials/12_planning.py.
 """
 from dataclasses import replace
 
