@@ -205,12 +205,12 @@ TERMS = {"chamfer": "$L_{CD}$ (Eq. 2), m$^2$", "distance_smoothness": "$L_{ds}$ 
          "inverse": "$L_{inv}$ (Sec. III-E), nats", "binary_masks": "points between masks"}
 
 
-def training_figure(log):
+def training_figure(log, no_motion={}):
     """How each loss term fell: one panel per term against the step, y logarithmic where all of it is positive.
 
     Paper: the terms of Eq. (6), before their weights.
     log: of `runs.train_saving`: dicts, one per epoch, of "step" and each term by name (the mean over the epoch);
-    "epoch" and "learning_rate" are not drawn -> Figure.
+    "epoch" and "learning_rate" are not drawn. no_motion: the same of a model that moves nothing, dashed -> Figure.
     """
     names = [name for name in log[0] if name not in ("epoch", "step", "learning_rate")]
     columns = min(3, len(names))
@@ -220,6 +220,9 @@ def training_figure(log):
         axes = figure.add_subplot(rows, columns, i + 1, label=name)
         values = [entry[name] for entry in log]
         axes.plot([entry["step"] for entry in log], values, ".-", color=PREDICTED, markersize=5, linewidth=1.5)
+        if name in no_motion:
+            axes.axhline(no_motion[name], linestyle="--", color="0.4", linewidth=1.2, label="no motion")
+            axes.legend(fontsize=8)
         if min(values) > 0:
             axes.set_yscale("log")
         axes.set(title=f"{name.replace('_', ' ')}\n{TERMS.get(name, '')}".strip(), xlabel="step")
