@@ -178,7 +178,8 @@ def test_the_truth_of_another_shard_and_poses_that_are_no_numbers_are_refused(tm
     ("evaluate run.npz data --json data/shard_0000.npz", "--json: expected a name ending in .json"),
     ("evaluate run.npz data --json link.json", "--json: link.json is a link"),
     ("evaluate run.npz data --json folder.json", "--json: folder.json is a link, a folder"),
-    ("evaluate run.npz data --json /dev/null", "--json: expected"), ("show run.npz data --out run.npz", "--out: expected"),
+    ("evaluate run.npz data --json /dev/null", "--json: expected"),
+    ("show run.npz data --out run.npz", "--out: expected"),
     ("train data own.npz", "own.csv: exists already")])
 def test_an_output_that_would_destroy_something_is_refused_before_the_work(arguments, said, tmp_path, capsys,
                                                                             monkeypatch):
@@ -197,7 +198,8 @@ def test_an_output_that_would_destroy_something_is_refused_before_the_work(argum
 # --- types that NumPy lets pass -----------------------------------------------------------------------------------
 
 B, H, W = 2, 3, 4
-CLOUD, MASK, IMAGE, FLOW = np.ones((B, H * W, 3)), np.ones((B, H * W), bool), np.ones((B, H, W, 3)), np.ones((B, H, W, 2))
+CLOUD, MASK = np.ones((B, H * W, 3)), np.ones((B, H * W), bool)
+IMAGE, FLOW = np.ones((B, H, W, 3)), np.ones((B, H, W, 2))
 
 
 @pytest.mark.parametrize("function, arguments, name", [
@@ -233,7 +235,8 @@ def test_a_record_of_pokes_that_stops_everything_later_is_refused_at_once(name, 
 # --- numbers without bound ----------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("arguments, said", [
-    ("collect c --pokes 1000000000000", "pokes: .*<= 1000000"), ("train data r.npz --batch 100000000", "batch: .*<= 4096"),
+    ("collect c --pokes 1000000000000", "pokes: .*<= 1000000"),
+    ("train data r.npz --batch 100000000", "batch: .*<= 4096"),
     ("train data r.npz --steps 1000000000000", "steps: .*<= "), ("collect c --jobs 100000", "jobs: .*<= 1024"),
     ("plan run.npz --horizon 1000000", "horizon: .*<= 10"), ("plan run.npz --candidates 10000000", "candidates: .*<="),
     ("collect c --size 400000 300000", "width: .* to 1280"), ("train data r.npz --width 100000", "width: .*<= 512")])

@@ -19,7 +19,7 @@ from ..networks import Sizes
 from ..sim.arena import Settings
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
-from ..sim.truth import load_truth
+from ..sim.truth import find_truth
 from . import control, evaluation, tables
 from .noise import under_noise
 from .processes import parallel_map
@@ -69,6 +69,14 @@ REPORT = (  # metric, unit, what it is, its baseline
 )
 GROUPS = (("", "all of them"), ("single_", "pokes that move one object"), ("multi_", "pokes that move two or more"),
           ("wall_", "pokes that end at a wall"), ("trimmed_", "without the worst 1 %"))
+
+
+def print_label_free(metrics):
+    print(f"{metrics['pokes']:.0f} pokes whose truth is not known: how well the predictions explain the next picture, "
+          "per poke:")
+    for name, unit, meaning in (("chamfer_cm2", "cm^2", "3D: Chamfer distance (Eq. 2)"),
+                                ("photometric", "", "2D: photometric error (Eq. 3)")):
+        print(f"  {meaning:<40}{metrics[name]:8.3f} {unit:<4}   no motion {metrics[f'no_motion_{name}']:.3f}")
 
 
 def print_metrics(metrics):
@@ -157,8 +165,9 @@ def folder_alone(args):
 def run_evaluate(args):
     folder_alone(args)
     run, interactions = checkpoints.load_run(args.checkpoint), load_interactions(args.data)
-    metrics = evaluation.evaluate(run, interactions, load_truth(args.data), progress_line("evaluate"))
-    print_metrics(metrics)
+    truth = find_truth(args.data)
+    metrics = evaluation.evaluate(run, interactions, truth, progress_line("evaluate"))
+    print_label_free(metrics) if truth is None else print_metrics(metrics)
     write_json(args.json, metrics)
 
 
@@ -167,10 +176,14 @@ def run_show(args):
     folder_alone(args)
     check_output("--out", args.out, ".png")
     run = checkpoints.load_run(args.checkpoint)
-    interactions, truth = load_interactions(args.data), load_truth(args.data)
+    interactions, truth = load_interactions(args.data), find_truth(args.data)
     row = args.row
     if row is None:  # a poke that moved something well, not the best one
-        motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
+        if truth is None:
+            motion = [np.abs(after - before)[(before > 0) & (after > 0)].sum()
+                      for before, after in zip(interactions.depth_before, interactions.depth_after)]
+        else:
+            motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
         row = int(np.argsort(motion)[int(0.7 * len(motion))])
     if not 0 <= row < len(interactions):
         raise ValueError(f"row: expected 0 to {len(interactions) - 1}, got {row}")

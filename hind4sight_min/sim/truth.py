@@ -79,3 +79,8 @@ def load_truth(folder):
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
     return Truth(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def find_truth(folder):
+    """The truth of a folder's shards, None where none of them has any: of a robot's pokes nobody knows it."""
+    return load_truth(folder) if any(truth_path(shard).exists() for shard in shards_in(folder)) else None
