@@ -2,7 +2,6 @@
 
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
-import ctypes
 import importlib
 import os
 import tempfile
@@ -89,14 +88,13 @@ def arena_camera(width, height):
 
 
 def import_quietly(name):
-    """Import a module whose C code prints when it is imported, as Bullet's does, into the figures of who reads us."""
-    kept, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 1)
+    """Import a module whose C code prints to stderr when it is imported, as Bullet's does."""
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
     try:
         return importlib.import_module(name)
     finally:
-        ctypes.CDLL(None).fflush(None)  # C has a buffer of its own
-        os.dup2(kept, 1)
+        os.dup2(kept, 2)
         os.close(kept)
         os.close(null)
 
