@@ -18,7 +18,9 @@ from hind4sight_min import losses
 from hind4sight_min.disk import checkpoints, files
 from hind4sight_min.disk.shards import load_interactions, save_shard, stamp
 from hind4sight_min.lab.cli import main
+from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.lab.runs import train_saving
+from hind4sight_min.sim import arena
 from hind4sight_min.sim.truth import load_truth, save_truth, truth_path
 from hind4sight_min.training import Recipe, start_run, training_step
 
@@ -300,3 +302,43 @@ def test_unusual_surroundings_do_not_matter(tmp_path):
     unread = program("course", "list", stdout=write)
     os.close(write)
     assert unread.communicate(timeout=60)[1] == "" and unread.returncode == 141
+
+
+def test_an_interrupt_does_not_wait_for_what_runs_elsewhere():
+    began = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt), parallel_map(2) as map:
+        for i, _ in enumerate(map(time.sleep, [0.01, 60, 0.01])):
+            raise KeyboardInterrupt
+    assert time.perf_counter() - began < 20
+
+
+def test_an_interrupt_during_import_is_one_line_too():
+    code = ("import sys, hind4sight_min.__main__ as program\n"
+            "class Slow:\n"
+            "    def find_spec(self, name, *_):\n"
+            "        if name.endswith('lab.cli'): raise KeyboardInterrupt\n"
+            "sys.meta_path.insert(0, Slow())\n"
+            "sys.exit(program.main())")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 130 and done.stderr == "\nhind4sight: stopped\n"
+
+
+@pytest.mark.parametrize("command, results", [
+    ("train data run.npz --steps 1 --batch 2 --width 8 --jobs 1", "run.npz"), ("collect pokes --pokes 3", "pokes")])
+def test_a_command_leaves_results_alone_that_another_process_works_on(command, results, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data_set(tmp_path / "data")
+    with files.only_one(results):
+        assert run(*command.split()) == 2
+    assert f"{results}: process {os.getpid()} on" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"data"}
+
+
+def test_a_texture_that_cannot_be_written_is_named(monkeypatch):
+    pytest.importorskip("pybullet")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"texture_0\.png: could not be written: No space left on device"):
+        arena.Arena(arena.Settings(), np.random.default_rng(0))
