@@ -35,7 +35,7 @@ class Fault(NamedTuple):
 # file, the tests that matter, and its faults: name, text, what takes its place
 PLANTED = (
     ("__init__.py", "planning", [
-        ("the least number that is allowed is refused", "value < least", "value <= least")]),
+        ("the least number that is allowed is refused", "least <= value <= most", "least < value <= most")]),
 
     ("geometry.py", "geometry eq1_transform", [
         ("principal point in the picture's middle", "np.arange(camera.width) - camera.cx",
@@ -130,7 +130,7 @@ PLANTED = (
         ("a half-written file stays behind", "temporary.unlink(missing_ok=True)", "pass"),
         ("files may run code", "allow_pickle=False", "allow_pickle=True")]),
     ("disk/shards.py", "interactions", [
-        ("depth cut off, not rounded", "np.round(arrays[name] / DEPTH_UNIT)", "np.floor(arrays[name] / DEPTH_UNIT)")]),
+        ("depth cut off, not rounded", "np.round(depth / DEPTH_UNIT)", "np.floor(depth / DEPTH_UNIT)")]),
     ("disk/checkpoints.py", "training", [
         ("a resumed run forgets its moments", "arrays.get(name, np.zeros(size, np.float32))",
          "np.zeros(size, np.float32)")]),

@@ -24,7 +24,23 @@ except (OSError, AttributeError, TypeError):  # another C library
 __version__ = "0.1.0"
 
 
-def check_whole(name, value, least):
-    """Raise a ValueError that says what is wrong unless `value` is a whole number of at least `least`."""
-    if not isinstance(value, numbers.Integral) or value < least:
-        raise ValueError(f"{name}: expected a whole number >= {least}, got {value}")
+def check_whole(name, value, least, most=float("inf")):
+    """Raise a ValueError that says what is wrong unless `value` is a whole number from `least` to `most`."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not least <= value <= most:
+        limit = f" and <= {most}" if most < float("inf") else ""
+        raise ValueError(f"{name}: expected a whole number >= {least}{limit}, got {value}")
+
+
+def check_arrays(**arrays):
+    """Raise a ValueError naming the array that is not of as many interactions as the first, or of another type than
+    bool for `valid`, whole numbers for `cells` and floating-point ones for all else: NumPy would let it pass.
+    """
+    count = len(next(iter(arrays.values())))
+    for name, value in arrays.items():
+        kinds, expected = ("f", "floating-point numbers")
+        if "valid" in name:
+            kinds, expected = ("b", "bool")
+        elif name == "cells":
+            kinds, expected = ("iu", "whole numbers")
+        if value.dtype.kind not in kinds or len(value) != count:
+            raise ValueError(f"{name}: expected {expected} of {count} interactions, got {value.dtype} of {len(value)}")

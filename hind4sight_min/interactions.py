@@ -40,6 +40,8 @@ class Interactions:
             settings = self.meta.get("settings")
             if not (isinstance(settings, dict) and 0 < settings.get(name, 0) < float("inf")):
                 raise ValueError(f"meta: expected settings with a positive {name!r} in m")
+        if not 1 <= settings["arena"] / settings["cell"] <= 500:
+            raise ValueError(f"meta: expected 1 to 500 cells along the arena, got a 'cell' of {settings['cell']} m")
         expected = {"rgb_before": (count, *size, 3), "rgb_after": (count, *size, 3),
                     "depth_before": (count, *size), "depth_after": (count, *size),
                     "pokes": (count, 3), "starts": (count, 2), "empty_depth": size}
@@ -53,6 +55,9 @@ class Interactions:
                                  f"got {value.dtype}")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+            if name in ("depth_before", "depth_after") and not (value.max(axis=(1, 2)) > 0).all():
+                raise ValueError(f"{name}: expected depth in every picture, got none in row "
+                                 f"{value.max(axis=(1, 2)).argmin()}")
 
     def __len__(self):
         return len(self.pokes)

@@ -31,7 +31,7 @@ class Sizes:
 
     def __post_init__(self):
         for name in vars(self):
-            check_whole(name, getattr(self, name), 2 if name == "masks" else 1)
+            check_whole(name, getattr(self, name), 2 if name == "masks" else 1, 8 if name == "rounds" else 512)
 
 
 @dataclass

@@ -66,8 +66,8 @@ class Search:
     chamfer_weight: float = 1.0
 
     def __post_init__(self):
-        for name in ("candidates", "elites", "iterations", "horizon"):
-            check_whole(name, getattr(self, name), 1)
+        for name, most in (("candidates", 10_000), ("elites", 10_000), ("iterations", 100), ("horizon", 10)):
+            check_whole(name, getattr(self, name), 1, most)
         if self.elites > self.candidates:
             raise ValueError(f"elites: expected at most {self.candidates}, the candidates, got {self.elites}")
         weights = self.pixel_weight, self.chamfer_weight

@@ -40,8 +40,8 @@ class Recipe:
     sizes: Sizes = Sizes()
 
     def __post_init__(self):
-        for name, least in (("steps", 1), ("batch", 1), ("warmup", 0), ("seed", 0)):
-            check_whole(name, getattr(self, name), least)
+        for name, least, most in (("steps", 1, 1e7), ("batch", 1, 4096), ("warmup", 0, 1e7), ("seed", 0, 2 ** 63)):
+            check_whole(name, getattr(self, name), least, most)
         if self.optimiser not in OPTIMISERS:
             raise ValueError(f"optimiser: expected one of {', '.join(OPTIMISERS)}, got {self.optimiser!r}")
         if not 0 < self.learning_rate < float("inf"):
@@ -93,6 +93,8 @@ def loss_terms(params, sizes, batch, camera, wanted=WEIGHTS):
     before, after, terms = batch.before, batch.after, {}
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     prediction = predict(params, sizes, before, batch.pokes)
+    if not np.isfinite(getval(prediction.points)).all():
+        raise FloatingPointError("the predicted points are not finite")
     flow = optical_flow(before.points, prediction.points, camera)  # the projection layer, Sec. III-C
     flow = flow.reshape(before.images.shape[:3] + (2,))
     if {"chamfer", "distance_smoothness"} & set(wanted):

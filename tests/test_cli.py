@@ -2,6 +2,7 @@
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 from functools import partial
@@ -10,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hind4sight_min import training
+from hind4sight_min import losses, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.lab import cli, control
 from hind4sight_min.lab.cli import data_small, main
 from hind4sight_min.lab.noise import under_noise
 from hind4sight_min.networks import Sizes, encode, predict, state_embedding
+from hind4sight_min.scene import crop
 from hind4sight_min.sim.truth import load_truth, save_truth
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -94,7 +96,7 @@ def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     recorded = json.loads((ROOT / "docs" / "results" / "shipped.json").read_text())["figures"]
     assert metrics == pytest.approx(recorded, rel=0.01, abs=1e-6)  # other NumPys and OpenCVs round differently
-    assert capsys.readouterr().err == "", "a progress line away from a terminal"
+    assert "\r" not in capsys.readouterr().err, "a progress line away from a terminal"
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
@@ -233,12 +235,74 @@ def test_an_interrupt_ends_in_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "\nhind4sight evaluate: stopped; what is on disk is whole\n"
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["collect"], ["evaluate", "--json"], *(
+@pytest.mark.parametrize("arguments", [["fly"], ["collect"], ["evaluate", "--json"], *(
     ["train", "data", "out.npz", "--weight", wrong] for wrong in ("chamfers=1", "chamfer", "chamfer=much"))])
 def test_usage_errors_are_one_line_too(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     one_line(capsys, stop.value.code, "--weight" if "train" in arguments else "")
+
+
+# --- what a newcomer tries first --------------------------------------------------------------------
+
+def test_the_command_alone_and_version(capsys):
+    assert run() == 0 and "COMMAND" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        run("--version")
+    assert stop.value.code == 0 and re.fullmatch(r"hind4sight \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_help_says_the_defaults(command, capsys):
+    with pytest.raises(SystemExit):
+        run(command, "--help")
+    out = " ".join(capsys.readouterr().out.split())
+    for name, how in cli.COMMANDS[command][2].items():
+        if how.get("default") not in (None, False):
+            assert re.search(rf"{name} .*default", out), name
+    assert command != "collect" or "(default 1000)" in out and "(default 64 48)" in out
+
+
+def test_a_folder_alone_is_the_data(small, capsys, monkeypatch):
+    monkeypatch.setitem(cli.SHIPPED, "default", small / "checkpoint.npz")
+    assert run("evaluate", small / "test") == 0
+    assert capsys.readouterr().out.startswith("6 pokes")
+
+
+def test_progress_is_one_line_on_a_terminal_and_one_every_ten_seconds_elsewhere(monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(cli.time, "perf_counter", lambda: clock[0])
+    for terminal, expected in ((False, ["work: 40 of 100, 15 s left", "work: 80 of 100, 5 s left"]),
+                               (True, [f"work: {done} of 100" for done in (0, 20, 40, 60, 80, 100)])):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+        clock[0], show = 0.0, cli.progress_line("work")
+        for done in range(0, 101, 20):
+            show(done, 100)
+            clock[0] += 5
+        err = capsys.readouterr().err
+        lines = [line for line in re.split(r"[\r\n]", err) if line]
+        assert len(lines) == len(expected) and all(map(str.startswith, lines, expected)), lines
+
+
+def test_train_says_the_total_beside_that_of_no_motion(small, tmp_path, capsys):
+    assert run("train", small / "train", tmp_path / "a.npz", *TINY) == 0
+    line = capsys.readouterr().out.splitlines()[0]
+    found, data = checkpoints.load_run(tmp_path / "a.npz"), load_interactions(small / "train")
+    terms = found.meta["log"][0]
+    assert f"total {sum(value * terms[name] for name, value in training.WEIGHTS.items()):.4g} (" in line
+    before, after = training.scenes_of(data)
+    before, after = (crop(each, data.pokes, data.camera) for each in (before, after))
+    valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    still = losses.chamfer_loss(*losses.distance_maps(before.points, after.points, valid, next_valid)).mean()
+    assert found.meta["no_motion"]["chamfer"] == pytest.approx(still, rel=1e-3)
+    assert f"chamfer {terms['chamfer']:.4g} ({still:.2g}"[:-1] in line and line.endswith("in brackets: without motion")
+
+
+@needs_bullet
+def test_bullet_keeps_its_banner_to_itself():
+    code = "from hind4sight_min.sim.arena import *; Arena(Settings(), np.random.default_rng(0)); print('done')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout == "done\n" and done.stderr == ""
 
 
 # --- the program ----------------------------------------------------------------------------------

@@ -161,6 +161,8 @@ def test_one_panel_per_term():
         assert axes.get_yscale() == ("linear" if name == "photometric" else "log")  # the one that is not positive
     assert "Eq. 2" in drawn["chamfer"].get_title() and drawn["surprise"].get_title() == "surprise"
     assert set(figures.TERMS) == set(training.WEIGHTS)
+    drawn = panels(figures.training_figure(LOG, {"photometric": 0.7}))
+    assert len(drawn["chamfer"].lines) == 1 and set(drawn["photometric"].lines[1].get_ydata()) == {0.7}, "no motion"
 
 
 # --- planning -------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def test_a_resumed_run_is_the_same_run_with_the_same_log(stop, tmp_path):
     train_saving(data, whole, tmp_path / "whole.npz")
 
     def interrupt(run, terms):
-        if run.step == stop + 1:
+        if run.step == stop:
             raise KeyboardInterrupt
     with pytest.raises(KeyboardInterrupt):
         train_saving(data, start_run(TINY, data), tmp_path / "run.npz", save_every=0.0, on_step=interrupt)

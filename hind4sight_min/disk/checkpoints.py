@@ -3,11 +3,13 @@ from dataclasses import asdict
 
 import numpy as np
 
+from .. import check_whole
 from ..networks import Sizes, init_parameters
 from ..training import Recipe, Run
 from .files import load_npz, save_npz
 
 FORMAT = "hind4sight_min checkpoint 5"
+MOST_BYTES = 200e6  # the largest Sizes, with the optimiser's state
 
 
 def save_run(path, run, resumable=True):
@@ -21,8 +23,12 @@ def save_run(path, run, resumable=True):
 
 def load_run(path):
     """Read a checkpoint -> Run. Raises ValueError naming the file and what is wrong, the layer too if one differs."""
-    arrays, meta = load_npz(path, FORMAT)
+    arrays, meta = load_npz(path, FORMAT, MOST_BYTES)
     try:
+        check_whole("step", meta["step"], 0)
+        for name, kind in (("log", list), ("sums", dict), ("seconds", float)):
+            if not isinstance(meta["run"].get(name, kind()), kind):
+                raise ValueError(f"run: {name}: expected a {kind.__name__}, got {meta['run'][name]!r}")
         recipe = Recipe(**{**meta["recipe"], "sizes": Sizes(**meta["recipe"]["sizes"])})
         template = init_parameters(recipe.sizes, np.random.default_rng(0))
         layout, found = {name: value.shape for name, value in template.items()}, meta["layout"]
@@ -36,5 +42,5 @@ def load_run(path):
                 raise ValueError(f"{name}: expected {size} finite numbers, got shape {value.shape}")
         moments = (arrays.get(name, np.zeros(size, np.float32)) for name in ("first_moment", "second_moment"))
         return Run(recipe, layout, arrays["vector"], *moments, meta["step"], meta["run"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -2,16 +2,43 @@
 format version). Beside each lies a `shard_0000.truth.npz` with what the simulator knows: sim/truth.py reads it, nothing
 here does.
 """
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from ..geometry import Camera
 from ..interactions import PER_POKE, Interactions
-from .files import load_npz, save_npz
+from .files import load_npz, plain, save_npz
 
 FORMAT = "hind4sight_min interactions 1"
 DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
+
+
+def counts_of(depth):
+    """Depth in m as it is stored, uint16."""
+    return np.clip(np.round(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+
+
+def stamp(interactions):
+    """What tells a data set from any other, plain JSON types: its seed, its settings, how many pokes it has and a
+    checksum of them, the same in memory and on disk.
+    """
+    checksum = 0
+    for name in PER_POKE:
+        for each in getattr(interactions, name):  # one by one: a copy of everything would not fit
+            each = counts_of(each) if name.startswith("depth") else each.astype(each.dtype.newbyteorder("<"))
+            checksum = zlib.crc32(np.ascontiguousarray(each), checksum)
+    return {"seed": interactions.meta.get("seed"), "settings": interactions.settings, "pokes": len(interactions),
+            "checksum": checksum}
+
+
+def check_same_data(name, old, new):
+    """Raise ValueError that says which entry differs unless two results of `stamp` are the same; None is not known."""
+    for entry in new if old else ():
+        if old.get(entry) != plain(new[entry]):
+            raise ValueError(f"{name}: expected the data it was made with, of {entry} {old.get(entry)}, "
+                             f"got {new[entry]}")
 
 
 def save_shard(path, interactions):
@@ -20,7 +47,7 @@ def save_shard(path, interactions):
             "units": {"depth": DEPTH_UNIT, "pokes": "m, m, rad", "starts": "m"}}
     arrays = {name: getattr(interactions, name) for name in (*PER_POKE, "empty_depth")}
     for name in ("depth_before", "depth_after", "empty_depth"):
-        arrays[name] = np.clip(np.round(arrays[name] / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+        arrays[name] = counts_of(arrays[name])
     save_npz(path, arrays, meta)
 
 
@@ -50,14 +77,17 @@ def shards_in(folder):
 
 
 def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions. Raises ValueError unless they share camera, arena and grid."""
+    """All shards of a folder, joined -> Interactions. Raises ValueError unless they are of one data set: of the same
+    camera and empty arena, and collected with the same seed and settings.
+    """
     paths = shards_in(folder)
     parts = [load_shard(path) for path in paths]
     first = parts[0]
     for path, part in zip(paths, parts):
-        same = all(part.settings[name] == first.settings[name] for name in ("arena", "cell"))
-        if (part.meta["camera"] != first.meta["camera"] or not same
-                or not np.array_equal(part.empty_depth, first.empty_depth)):
-            raise ValueError(f"{path}: another camera, arena or grid than the folder's first shard")
+        for name in ("camera", "settings", "seed"):
+            if part.meta.get(name) != first.meta.get(name):
+                raise ValueError(f"{path}: of another data set than the folder's first shard: its {name} differs")
+        if not np.array_equal(part.empty_depth, first.empty_depth):
+            raise ValueError(f"{path}: of another data set than the folder's first shard: its empty arena differs")
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POKE}
     return Interactions(**joined, empty_depth=first.empty_depth, camera=first.camera, meta=first.meta)

@@ -258,7 +258,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
-    check_whole("budget", budget, 1)
+    check_whole("budget", budget, 1, 1000)
     arena, rng = task.arena, np.random.default_rng(seed)
     check_camera(run, arena.camera)
     (rgb, depth, labels), view, goal = first_look(task)

@@ -1,11 +1,12 @@
 """Metrics, with the unit in the name, beside the no-motion baseline and chance. Paper: Sec. IV-C to IV-F.
 
-This file reads the simulator's truth; training does not.
+This file reads the simulator's truth, where there is one; training does not.
 """
 from dataclasses import dataclass
 
 import numpy as np
 
+from .. import losses
 from ..geometry import optical_flow, unproject
 from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
@@ -129,16 +130,39 @@ def errors_of_poke(run, interactions, truth, row, depth_noise=0.0):
 
 # --- the summary --------------------------------------------------------------------------------------------------
 
-def evaluate(run, interactions, truth, progress=None, depth_noise=0.0):
-    """All metrics on a data set -> flat dict of floats; see `summary`. depth_noise: SD in m of noise on the depth that
-    the model sees. progress(done, total) is called after every poke.
+def evaluate(run, interactions, truth=None, progress=None, depth_noise=0.0):
+    """All metrics on a data set -> flat dict of floats; see `summary`, and without a truth `label_free_errors`, whose
+    means over the pokes these then are. depth_noise: SD in m of noise on the depth that the model sees.
+    progress(done, total) is called after every poke.
     """
     pokes = []
     for row in range(len(interactions)):
-        pokes.append(errors_of_poke(run, interactions, truth, row, depth_noise))
+        pokes.append(label_free_errors(run, interactions, row, depth_noise) if truth is None else
+                     errors_of_poke(run, interactions, truth, row, depth_noise))
         if progress:
             progress(row + 1, len(interactions))
+    if truth is None:
+        return {"pokes": float(len(pokes)),
+                **{name: float(np.mean([poke[name] for poke in pokes])) for name in pokes[0]}}
     return summary(pokes, interactions.pokes, scenes_of_pokes(truth))
+
+
+def label_free_errors(run, interactions, row, depth_noise=0.0):
+    """What can be said of one poke whose truth nobody knows: how well the prediction explains the next picture.
+
+    Paper: Eq. (2) and (3), sums over the pixels that count, in cm^2 and in intensity, and no_motion_* the same where
+    nothing moves. They fall with better predictions, but noise and what the poke uncovers keep them above 0.
+    """
+    answer = ask(run, interactions, row, depth_noise)
+    before, after = answer.before, answer.after
+    valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
+    found = {}
+    for prefix, points, flow in (("", answer.prediction.points, answer.flow[None]),
+                                 ("no_motion_", before.points, 0 * answer.flow[None])):
+        maps = losses.distance_maps(points, after.points, valid, next_valid)
+        found[f"{prefix}chamfer_cm2"] = 1e4 * losses.chamfer_loss(*maps)[0]
+        found[f"{prefix}photometric"] = losses.photometric_loss(before.images, after.images, flow, valid)[0]
+    return found
 
 
 def scenes_of_pokes(truth):

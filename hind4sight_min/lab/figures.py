@@ -157,43 +157,50 @@ def _draw_losses(panels, answer):
 
 # --- one poke, one training run ------------------------------------------------------------------------------
 
-def interaction_figure(interactions, row, answer, truth):
+def interaction_figure(interactions, row, answer, truth=None):
     """One poke: what was seen, what the model says of it, what the losses see of that, and what is true. -> Figure
 
     Paper: the quantities of Fig. 3 and 4 (Eq. 1-3, Sec. III-C and III-E). answer: of `evaluation.ask` for this row;
-    truth: of the whole data set. A mask's colour is its place in PALETTE, an object's that of its number.
+    truth: of the whole data set; without one its panels are left out. A mask's colour is its place in PALETTE, an
+    object's that of its number.
     """
     camera, settings, before, after = interactions.camera, interactions.settings, answer.before, answer.after
     poke, start, image = interactions.pokes[row], interactions.starts[row], before.images[0]
-    points, valid, labels = before.points[0], before.valid[0], truth.labels[row]
-    true, true_pixels, moving = true_motion(interactions, truth, row)
-    numbers = np.arange(1, 1 + max(1, labels.max()))
-    moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(labels.shape)])
-    flows = [flow.reshape(*labels.shape, 2) * valid.reshape(*labels.shape, 1) for flow in (answer.flow, true_pixels)]
-    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for flow in flows))  # px
+    points, valid, size = before.points[0], before.valid[0], image.shape[:2]
+    flows = {"flow": answer.flow}
+    arrows = [((answer.prediction.points[0] - points)[valid], PREDICTED, 0.013, "predicted")]
+    if truth is not None:
+        true, flows["true_flow"], moving = true_motion(interactions, truth, row)
+        labels = truth.labels[row]
+        numbers = np.arange(1, 1 + max(1, labels.max()))
+        moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(size)])
+        arrows.insert(0, (true[valid], TRUE, 0.026, "true"))  # first and wider, so that both are seen where they agree
+    flows = {name: flow.reshape(*size, 2) * valid.reshape(*size, 1) for name, flow in flows.items()}
+    scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for flow in flows.values()))  # px
 
     figure = Figure(figsize=(14, 8.5), dpi=100, layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=(1.7, 1))
-    panels = {**upper.subplot_mosaic([["before", "masks", "labels", "flow", "true_flow"],
-                                      ["after", "warped", "error", "distance_predicted", "distance_observed"]]),
+    true_labels, true_flow = (".", ".") if truth is None else ("labels", "true_flow")  # a dot is an empty place
+    first = ["before", "masks", true_labels, "flow", true_flow]
+    panels = {**upper.subplot_mosaic([first, ["after", "warped", "error", "distance_predicted", "distance_observed"]]),
               **lower.subplot_mosaic([["scene_flow", "start", "end"]], width_ratios=(1.7, 1, 1))}
     figure.suptitle(f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0", fontsize=13)
-    for label, title, picture in (
-            ("before", "Before: image $I_t$\nand the poke $u_t$", image),
-            ("after", "After: image $I_{t+1}$", after.images[0]),
-            ("masks", "Predicted masks $m_t^k$ (Eq. 1)\na colour each",
-             blend(image, answer.prediction.masks[0, :, 1:].reshape(*labels.shape, -1))),
-            ("labels", "True objects that moved\n(colours of their own)", blend(image, moved.astype(float))),
-            ("flow", "Predicted optical flow\n(U, V), Sec. III-C", flow_to_rgb(flows[0], scale)),
-            ("true_flow", "True optical flow\n(same colours)", flow_to_rgb(flows[1], scale))):
+    pictures = [
+        ("before", "Before: image $I_t$\nand the poke $u_t$", image),
+        ("after", "After: image $I_{t+1}$", after.images[0]),
+        ("masks", "Predicted masks $m_t^k$ (Eq. 1)\na colour each",
+         blend(image, answer.prediction.masks[0, :, 1:].reshape(*size, -1))),
+        ("flow", "Predicted optical flow\n(U, V), Sec. III-C", flow_to_rgb(flows["flow"], scale))]
+    if truth is not None:
+        pictures += [("labels", "True objects that moved\n(colours of their own)", blend(image, moved.astype(float))),
+                     ("true_flow", "True optical flow\n(same colours)", flow_to_rgb(flows["true_flow"], scale))]
+    for label, title, picture in pictures:
         show_image(panels[label], picture, title)
     arrow = on_table([start, poke[:2]], camera)
     draw_arrow(panels["before"], *arrow)
     _draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
     _draw_losses(panels, answer)
-    flows = [(true[valid], TRUE, 0.026, "true"),  # first and wider, so that both are seen where they agree
-             ((answer.prediction.points[0] - points)[valid], PREDICTED, 0.013, "predicted")]
-    _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], flows, start, poke[:2],
+    _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      settings["arena"])
     for which, symbol, heatmap, place in zip(("start", "end"), "AB", answer.heatmaps, (start, poke[:2])):
         _draw_heatmap(panels[which], heatmap.reshape(grid_shape(settings)), place, settings["arena"], which, symbol)
@@ -205,12 +212,12 @@ TERMS = {"chamfer": "$L_{CD}$ (Eq. 2), m$^2$", "distance_smoothness": "$L_{ds}$ 
          "inverse": "$L_{inv}$ (Sec. III-E), nats", "binary_masks": "points between masks"}
 
 
-def training_figure(log):
+def training_figure(log, no_motion={}):
     """How each loss term fell: one panel per term against the step, y logarithmic where all of it is positive.
 
     Paper: the terms of Eq. (6), before their weights.
     log: of `runs.train_saving`: dicts, one per epoch, of "step" and each term by name (the mean over the epoch);
-    "epoch" and "learning_rate" are not drawn -> Figure.
+    "epoch" and "learning_rate" are not drawn. no_motion: the same of a model that moves nothing, dashed -> Figure.
     """
     names = [name for name in log[0] if name not in ("epoch", "step", "learning_rate")]
     columns = min(3, len(names))
@@ -220,6 +227,9 @@ def training_figure(log):
         axes = figure.add_subplot(rows, columns, i + 1, label=name)
         values = [entry[name] for entry in log]
         axes.plot([entry["step"] for entry in log], values, ".-", color=PREDICTED, markersize=5, linewidth=1.5)
+        if name in no_motion:
+            axes.axhline(no_motion[name], linestyle="--", color="0.4", linewidth=1.2, label="no motion")
+            axes.legend(fontsize=8)
         if min(values) > 0:
             axes.set_yscale("log")
         axes.set(title=f"{name.replace('_', ' ')}\n{TERMS.get(name, '')}".strip(), xlabel="step")

@@ -17,8 +17,8 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing. Every pixel of every picture has
     noise of its own.
     """
-    if not 0 <= standard_deviation < float("inf"):
-        raise ValueError(f"standard_deviation: expected a number of metres >= 0, got {standard_deviation}")
+    if not 0 <= standard_deviation <= 10:
+        raise ValueError(f"standard_deviation: expected 0 to 10 m, got {standard_deviation}")
     valid = depth > 0
     pictures = depth.reshape(-1, *depth.shape[-2:])
     median = np.array([np.median(each[each > 0]) if each.any() else 1.0 for each in pictures], depth.dtype)

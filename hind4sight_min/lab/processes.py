@@ -3,20 +3,23 @@ import os
 import signal
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
+
+import numpy as np
 
 from .. import check_whole
 
 
 def _begin_worker():
-    """Leave an interrupt to the parent to handle, and end with it, however it ends: a worker that went on alone would
-    write into the files of the next attempt.
+    """End with the parent, however it ends: a worker that went on alone would write into the files of the next attempt.
+    What overflows is for the parent to find and say.
     """
     def wait():
         parent_process().join()
         os._exit(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's to handle
+    np.seterr(all="ignore")
     Thread(target=wait, daemon=True).start()
 
 
@@ -36,7 +39,7 @@ def parallel_map(jobs):
     Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
     Raises ValueError for a number of processes that cannot be.
     """
-    check_whole("jobs", jobs, 1)
+    check_whole("jobs", jobs, 1, 1024)
     if jobs == 1:
         yield map
         return
@@ -44,10 +47,18 @@ def parallel_map(jobs):
 
     def parallel(function, *arguments):
         calls = list(zip(*arguments))
+        # Processes are started here, and an interrupt is ours to handle from their first moment on.
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         given = {i: pool.submit(function, *call) for i, call in enumerate(calls) if i % jobs}
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         for i, call in enumerate(calls):
             yield given[i].result() if i in given else function(*call)
+    others = active_children()
     try:
         yield parallel
+    except BaseException:  # an interrupt, say, must not wait for what runs: files are whole or not there
+        for process in set(active_children()) - set(others):
+            process.terminate()
+        raise
     finally:
-        pool.shutdown(cancel_futures=True)  # after an interrupt, what has not begun is left for the next call
+        pool.shutdown(cancel_futures=True)

@@ -2,6 +2,8 @@
 
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
+import importlib
+import os
 import tempfile
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 
 from .. import check_whole
+from ..disk.files import whole_file
 from ..geometry import Camera
 from ..interactions import cell_centres, finger_fits, occupied_grid
 from ..scene import scene_of
@@ -64,7 +67,7 @@ class Settings:
                 (abs(cells - round(cells)) < 1e-6, "cell", "one that the arena has a whole number of"),
                 (self.place_within <= 1, "place_within", "a share of the arena, at most 1"),
                 (paths, "poke_length", "(least, most) in m, shorter than the arena"),
-                (self.width >= 16 and self.width * 3 == self.height * 4, "width", "4/3 of height, and at least 16")):
+                (16 <= self.width <= 1280 and self.width * 3 == self.height * 4, "width", "4/3 of height, 16 to 1280")):
             if not good:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
 
@@ -84,6 +87,18 @@ def arena_camera(width, height):
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, pose)
 
 
+def import_quietly(name):
+    """Import a module whose C code prints to stderr when it is imported, as Bullet's does."""
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        return importlib.import_module(name)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
+
+
 # --- the arena ----------------------------------------------------------------------------------------------------
 
 class Arena:
@@ -96,7 +111,7 @@ class Arena:
 
     def __init__(self, settings, rng):
         try:
-            import pybullet
+            pybullet = import_quietly("pybullet")
         except ImportError:
             raise RuntimeError("the simulator needs pybullet, which is not installed: pip install pybullet "
                                "(ready-made for Python 3.11 and older; later versions compile it)") from None
@@ -139,9 +154,11 @@ class Arena:
         self._view, self._textures = opengl_from_arena.T.ravel().tolist(), []
         with tempfile.TemporaryDirectory() as folder:
             for i in range(24):
-                path = str(Path(folder) / f"texture_{i}.png")
-                cv2.imwrite(path, draw_texture(s.textures[i % len(s.textures)], self.rng)[..., ::-1])
-                self._textures.append(p.loadTexture(path))
+                path = Path(folder) / f"texture_{i}.png"
+                picture = draw_texture(s.textures[i % len(s.textures)], self.rng)[..., ::-1]
+                with whole_file(path) as temporary:  # raises where the disk is full
+                    temporary.write_bytes(cv2.imencode(".png", picture)[1])
+                self._textures.append(p.loadTexture(str(path)))
 
     def _build_finger(self):
         """A vertical cylinder that slides along x, y and z: it stalls at its force limit, it cannot tilt."""

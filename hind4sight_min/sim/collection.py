@@ -13,6 +13,7 @@ from ..interactions import Interactions
 from .arena import Arena, Settings
 from .truth import Truth, save_truth, truth_path
 
+MOST_POKES = 1_000_000  # shards are numbered with four digits
 SHARD_POKES = 100  # one shard is one world, so the data do not depend on who collects it
 
 
@@ -63,7 +64,7 @@ def _outcome(before, after, count, at_rest, settings):
 def _collect_file(settings, seed, job):
     index, path, pokes = job
     interactions, truth = collect_shard(settings, seed, index, pokes)
-    save_truth(path, truth)  # first, so that a shard never lacks its truth
+    save_truth(path, truth, interactions)  # first, so that a shard never lacks its truth
     save_shard(path, interactions)
     return interactions.meta["counts"]
 
@@ -75,7 +76,7 @@ def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None):
     after every shard. Returns the counts of kept and dropped pokes, a dict.
     Raises ValueError for bad counts or a folder with other data in it.
     """
-    check_whole("pokes", pokes, 1)
+    check_whole("pokes", pokes, 1, MOST_POKES)
     check_whole("seed", seed, 0)
     counts, jobs = Counter(), {}
     for index, first in enumerate(range(0, pokes, SHARD_POKES)):

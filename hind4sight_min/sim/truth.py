@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..disk.files import load_npz, save_npz
-from ..disk.shards import FORMAT, load_shard, shards_in
+from ..disk.shards import FORMAT, check_same_data, load_shard, shards_in, stamp
 
 
 @dataclass
@@ -17,10 +17,16 @@ class Truth:
 
     labels: (M, H, W) uint8 before the poke, 0 = background, i + 1 = object i.
     poses_before, poses_after: (M, 7, 7) float32, arena, per object (x, y, z, qx, qy, qz, qw); unused rows 0.
+    Raises ValueError for poses that are not finite.
     """
     labels: np.ndarray
     poses_before: np.ndarray
     poses_after: np.ndarray
+
+    def __post_init__(self):
+        for name in ("poses_before", "poses_after"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
 
     def __getitem__(self, rows):
         return Truth(self.labels[rows], self.poses_before[rows], self.poses_after[rows])
@@ -47,22 +53,34 @@ def truth_path(shard):
     return Path(shard).with_suffix("").with_suffix(".truth.npz")
 
 
-def save_truth(shard, truth):
-    """Write the truth file of a shard, whole or not at all."""
-    save_npz(truth_path(shard), dict(vars(truth)), {"format": FORMAT})
+def save_truth(shard, truth, interactions=None):
+    """Write the truth file of a shard, whole or not at all; with its pokes it says to which ones it belongs."""
+    save_npz(truth_path(shard), dict(vars(truth)),
+             {"format": FORMAT, "of": None if interactions is None else stamp(interactions)})
 
 
 def load_truth(folder):
-    """The truth of all shards of a folder, joined -> Truth, in the order of `load_interactions`."""
+    """The truth of all shards of a folder, joined -> Truth, in the order of `load_interactions`.
+
+    Raises ValueError naming the file that is not its shard's or not what a Truth holds.
+    """
     parts = []
     for shard in shards_in(folder):
-        path, pictures = truth_path(shard), load_shard(shard).depth_before.shape
-        part, _ = load_npz(path, FORMAT)
+        path, interactions = truth_path(shard), load_shard(shard)
+        pictures, (part, meta) = interactions.depth_before.shape, load_npz(path, FORMAT)
+        check_same_data(path, meta.get("of"), stamp(interactions))
         poses = (pictures[0], 7, 7)
         for name, shape in (("labels", pictures), ("poses_before", poses), ("poses_after", poses)):
             found = part[name].shape if name in part else "nothing"
             if found != shape:
                 raise ValueError(f"{path}: {name}: expected shape {shape}, got {found}")
-        parts.append(part)
-    return Truth(*(np.concatenate([part[name] for part in parts])
-                   for name in ("labels", "poses_before", "poses_after")))
+        try:
+            parts.append(Truth(**{name: part[name] for name in ("labels", "poses_before", "poses_after")}))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+    return Truth(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def find_truth(folder):
+    """The truth of a folder's shards, None where none of them has any: of a robot's pokes nobody knows it."""
+    return load_truth(folder) if any(truth_path(shard).exists() for shard in shards_in(folder)) else None
