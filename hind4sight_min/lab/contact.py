@@ -76,7 +76,9 @@ def watched_pokes(run, settings, seed, job):
     for row, scene in enumerate(scenes_of_pokes(truth)):
         pressed, bodies, kinds, poses = notes[key_of(truth.poses_before[row], interactions.pokes[row])]
         flow, _, moving = true_motion(interactions, truth, row)
-        aside, _, _ = true_motion(interactions, replace(truth, poses_after={row: poses}), row)
+        ends = truth.poses_after.copy()
+        ends[row] = poses
+        aside, _, _ = true_motion(interactions, replace(truth, poses_after=ends), row)
         moved = [label - 1 for label in np.unique(truth.labels[row].ravel()[moving]) if label > 0]
         pairs = [pair for pair in pressed if pair & {bodies[i] for i in moved}]
         contact, wall = any(pair <= set(bodies) for pair in pairs), any(pair & WALLS for pair in pairs)

@@ -17,14 +17,15 @@ MOST_POKES = 1_000_000  # shards are numbered with four digits
 SHARD_POKES = 100  # one shard is one world, so the data do not depend on who collects it
 
 
-def collect_shard(settings, seed, index, pokes, world=Arena):
-    """Collect one shard -> (Interactions, Truth). The same arguments give the same data. world: what makes the Arena.
+def collect_shard(settings, seed, index, pokes, world=None):
+    """Collect one shard -> (Interactions, Truth). The same arguments give the same data. world: what makes the
+    world, an Arena if not given.
 
     Interactions are dropped, and counted in meta["counts"], when an object left the arena, is out of the camera's
     sight, or never came to rest. Raises ValueError for settings under which that is nearly always so.
     """
     kept, counts = [], Counter(kept=0, left_arena=0, out_of_view=0, not_at_rest=0, no_free_start=0)
-    with world(settings, np.random.default_rng([seed, index])) as arena:
+    with (world or Arena)(settings, np.random.default_rng([seed, index])) as arena:
         left = 0  # pokes that the scene is still good for
         while len(kept) < pokes:
             if not left:
