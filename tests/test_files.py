@@ -1,5 +1,7 @@
 """Files are whole or not there; damaged and foreign ones are refused by name."""
+import io
 import pickle
+import zipfile
 
 import numpy as np
 import pytest
@@ -69,7 +71,17 @@ class Trap:
         return Trap.sprung.append, (1,)
 
 
+def disguise(path):
+    """A trap that is as large as its header says."""
+    payload, header = pickle.dumps(Trap()), io.BytesIO()
+    count = -(-len(payload) // 8)
+    np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": (count,)})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("trap.npy", header.getvalue() + payload.ljust(8 * count))
+
+
 @pytest.mark.parametrize("make, words", [
+    (disguise, ["damaged"]),
     (lambda path: path.unlink(), ["no such file"]),
     (lambda path: (path.unlink(), path.mkdir()), ["no such file"]),
     (lambda path: path.write_bytes(b""), ["damaged"]),
