@@ -111,8 +111,8 @@ def read_zip(path, name):
                 parts = each.filename.split("/")
                 if ".." in parts or parts[0] == "" or parts[0][1:2] == ":" or stat.S_ISLNK(each.external_attr >> 16):
                     raise ValueError(f"{path.name}: refused, for {each.filename!r} in it leads out of its folder")
-            found = sorted((each for each in members if Path(each.filename).name == name
-                            and not each.is_dir() and not ignored(each.filename)), key=lambda each: in_order(each.filename))
+            found = sorted((each for each in members if Path(each.filename).name == name and not each.is_dir()
+                            and not ignored(each.filename)), key=lambda each: in_order(each.filename))
             if not found:
                 raise ValueError(f"{path.name}: there is no {name} in it")
             with archive.open(found[-1]) as file:
