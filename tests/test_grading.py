@@ -160,10 +160,12 @@ def test_what_is_no_scene_flow_is_refused(flow, words):
 
 
 def test_a_student_trains_and_predicts_in_the_sandbox():
-    source = b"import numpy as np\ndef train(interactions, seed):\n" \
+    source = b"import os\nimport numpy as np\ndef train(interactions, seed):\n" \
+             b"    try:\n        raise SystemExit(os.fork())\n" \
+             b"    except BlockingIOError:  # a second process would have ten minutes of its own\n        pass\n" \
              b"    return lambda pokes: np.zeros((len(pokes), pokes.camera.height * pokes.camera.width, 3))\n"
-    results = grading.grade(grading.items_of(assignment_of("improve"), HOW), source)
-    assert results["leaderboard"] == [{"name": "flow_mse_ratio", "value": 1.0, "order": "asc"}]
+    results = grading.grade(grading.items_of(assignment_of("improve"), replace(HOW, limits=None)), source)
+    assert results.get("leaderboard") == [{"name": "flow_mse_ratio", "value": 1.0, "order": "asc"}], results
     assert results["score"] == 0, "no motion earns nothing"
 
 
@@ -204,6 +206,12 @@ def test_a_file_that_says_its_encoding_is_left_alone():
     said = "# coding: gbk\nNAME = '\u6df1\u5ea6'\n".encode("gbk")
     assert grading.as_utf8(said) == said
     assert grading.as_utf8("# coding: utf-8\nx = 1  # caf\xe9\n".encode("latin-1")).decode().endswith("caf\xe9\n")
+
+
+def test_the_truth_of_the_shipped_pokes_is_not_to_be_seen(monkeypatch):
+    assert sandbox.HIDDEN[1].name == "hind4sight_min"
+    monkeypatch.setattr(sandbox, "HIDDEN", (sandbox.PACKAGE, Path(json.__file__).parent))
+    assert str(Path(json.__file__).parent) in sandbox.surroundings(tempfile.gettempdir())["hidden"]
 
 
 def test_no_network(tmp_path):
@@ -439,6 +447,8 @@ def test_a_killed_grader_leaves_whole_results_and_no_process(tmp_path):
             time.sleep(0.05)
         time.sleep(2)  # past its imports: an end of the pipe alone would not stop it any more
         assert process.poll() is None
+        first_to_go = [Path(f"/proc/{each}/oom_score_adj").read_text() for each in left_behind(folder)]
+        assert {*first_to_go} == {"1000\n"}, "where memory runs out, the students' processes end first"
         process.send_signal(signal.SIGKILL)
         process.wait()
         end = time.monotonic() + 5

@@ -59,8 +59,8 @@ from them.
 
 ## How it is graded
 
-On pokes that you do not have, from scenes of neither. The score is the squared error of your scene flow over all points
-that moved, divided by that of predicting no motion: {baseline} or more earns nothing (`improve.py` as it is reaches
-0.6), {target} or less all {points} points, in between on the line from one to the other. The leaderboard shows the
-ratio.
+On pokes that you do not have, from scenes of neither, each the first of its scene. The score is the squared error of
+your scene flow over all points that moved, divided by that of predicting no motion: {baseline} or more earns nothing
+(`improve.py` as it is reaches 0.6), {target} or less all {points} points, in between on the line from one to the other.
+The leaderboard shows the ratio.
 """
