@@ -26,9 +26,9 @@ from pathlib import Path
 import numpy as np
 
 from . import channel
+from .bugs import PACKAGE
 
 WORKER = Path(__file__).with_name("worker.py")
-PACKAGE = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
