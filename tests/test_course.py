@@ -261,7 +261,7 @@ def test_a_model_measurement_shows_each_bug_and_passes_right_code(number):
 
 
 def test_the_broken_packages_come_without_sources(tmp_path):
-    bugs.write_package(3, tmp_path)
+    bugs.write_compiled(3, tmp_path)
     assert {path.suffix for path in tmp_path.rglob("*.*")} == {".pyc"} and not (tmp_path / "package/course").exists()
     with pytest.raises((OSError, TypeError)):
         inspect.getsource(bugs.broken(3).ops.nearest_squared_distances)

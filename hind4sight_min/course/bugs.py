@@ -82,7 +82,7 @@ def mutated(number):
     return mutant.file, source.replace(mutant.text, mutant.instead)
 
 
-def write_package(number, folder, name="package"):
+def write_compiled(number, folder, name="package"):
     """The package with a mutant, or 0 for none, compiled, as `folder`/`name`; the course is left out."""
     changed = dict([mutated(number)] if number else [])
     for path in PACKAGE.rglob("*.py"):
@@ -96,7 +96,7 @@ def write_package(number, folder, name="package"):
 
 
 def import_package(folder, name="package"):
-    """Import what `write_package` wrote, with its modules: package.losses, package.lab.evaluation and so on."""
+    """Import what `write_compiled` wrote, with its modules: package.losses, package.lab.evaluation and so on."""
     sys.path.insert(0, str(folder))
     try:
         for part in PARTS:
@@ -113,7 +113,7 @@ def broken(number):
     name = f"bug_{number:02}"
     if name not in sys.modules:
         with tempfile.TemporaryDirectory() as folder:
-            write_package(number, folder, name)
+            write_compiled(number, folder, name)
             import_package(folder, name)
     return sys.modules[name]
 

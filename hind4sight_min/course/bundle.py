@@ -11,8 +11,8 @@ from pathlib import Path
 from .. import __version__
 from ..disk.files import whole_file
 from ..lab.cli import data_small
+from .bugs import PACKAGE
 
-PACKAGE = Path(__file__).resolve().parents[1]
 NOT_NEEDED = ("pybullet",)  # to simulate; students leave `import matplotlib` in
 
 SETUP = """#!/bin/bash

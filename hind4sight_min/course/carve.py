@@ -57,7 +57,7 @@ def _carved(task, functions, so_far):
     if not documented:
         text += textwrap.indent(textwrap.fill(f'"""{task.title}. {task.notes}"""', 112), "    ").splitlines()
     text.append(f'    raise NotImplementedError("Task {task.number}: {task.title}")')
-    for other in tree.body:
+    for other in tree.body:  # defvjp(primitive, its VJP): behind the later one of the two
         named = _names(other) & set(functions) if isinstance(other, ast.Expr) else set()
         if task.function in named and named <= set(so_far):
             text += ["", "", ast.get_source_segment(source, other)]

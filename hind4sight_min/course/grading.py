@@ -172,7 +172,7 @@ def mark_task(assignment, task, how, content):
     try:
         answers = answers_from(outcome.answer)
         if how.seed is not None:
-            answers[1:] = [replace(each, error=quiet(each.error)) for each in answers[1:]]
+            answers[1:] = [replace(each, error=quiet(each.error)) for each in answers[1:]]  # students have the first
         verdict = judge(task, cases, answers)
     except (MemoryError, RuntimeError):  # ours: the reference itself fails
         raise

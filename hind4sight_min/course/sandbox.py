@@ -27,9 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from . import channel
+from .bugs import PACKAGE
 
 WORKER = Path(__file__).with_name("worker.py")
-PACKAGE = Path(__file__).resolve().parents[1]
 HIDDEN = PACKAGE, Path(sysconfig.get_path("data"), "share", "hind4sight_min")  # the second: the shipped pokes' truth
 
 
