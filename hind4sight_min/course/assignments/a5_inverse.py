@@ -165,7 +165,7 @@ TASKS = (
              "exp overflows: subtract the largest logit first": lambda z, cells: -anp.log(picked(naive(z), cells)),
              "The logarithm is missing": lambda z, cells: picked(softmax(z), cells),
              "The softmax is missing": lambda z, cells: -picked(z, cells),
-             "Cells are counted from 0": lambda z, cells: heatmap_cross_entropy(z, cells - 1),
+             "Cells are counted from 0": lambda z, cells: heatmap_cross_entropy(z, (cells - 1) % z.shape[1]),
              "The mean over the interactions: one number each":
                  lambda z, cells: anp.mean(heatmap_cross_entropy(z, cells))}),
     Task("5.4", "losses.embedding_loss", "L_sim", 10, 5, embedding_cases, gradient=("predicted", "observed"), mistakes={
