@@ -62,3 +62,22 @@ def test_seconds_add_up_over_calls_and_a_checkpoint_is_written_in_time(tmp_path,
     run.recipe = replace(run.recipe, steps=10)
     train_saving(data, run, tmp_path / "run.npz", on_step=tick)
     assert run.meta["seconds"] == 250.0
+
+
+def test_an_interrupt_within_a_step_saves_the_step_before(tmp_path, monkeypatch):
+    data, muon = tiny_pokes(), training.OPTIMISERS["muon"]
+
+    def cut_off(run, gradient, rate):
+        step = muon(run, gradient, rate)  # the moments have moved on, the parameters not yet
+        if run.step == 3:
+            raise KeyboardInterrupt
+        return step
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setitem(training.OPTIMISERS, "muon", cut_off)
+        train_saving(data, start_run(TINY, data), tmp_path / "run.npz")
+    saved, same = load_run(tmp_path / "run.npz"), start_run(TINY, data)
+    for _ in range(2):
+        training.training_step(data, same)
+    assert saved.step == 2
+    for name in ("vector", "first_moment", "second_moment"):
+        np.testing.assert_array_equal(getattr(saved, name), getattr(same, name), err_msg=name)
