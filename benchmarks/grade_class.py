@@ -77,7 +77,7 @@ HOSTILE = {
         shutil.rmtree(os.getcwd(), ignore_errors=True)""",
     "parent": """
         os.kill(os.getppid(), signal.SIGKILL)
-        time.sleep(1)""",
+        time.sleep(0.2)""",
     "memory of the grader": f"""
         pid = os.getppid()
         for _ in range(2):  # the process that watches this one, and the grader
