@@ -13,6 +13,7 @@ import pytest
 
 from hind4sight_min.course import ASSIGNMENTS, assignment_of, bugs, carve
 from hind4sight_min.course.task import Task, answers_of, judge, namespace_of
+from hind4sight_min.disk import files
 from hind4sight_min.lab.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -244,8 +245,9 @@ def test_a_plain_install_finds_the_tests_that_it_hands_out(tmp_path, monkeypatch
     folder.mkdir(parents=True)
     for path in [path for pattern in shipped for path in ROOT.glob(pattern)]:
         (folder / path.name).write_text(path.read_text())
-    monkeypatch.setattr(carve, "__file__", str(tmp_path / "site-packages/hind4sight_min/course/carve.py"))
-    monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "site-packages/hind4sight_min/disk/files.py"))
+    monkeypatch.setattr(sysconfig, "get_path", lambda name, scheme: str(tmp_path))
+    assert carve.tests_folder() == folder
     for assignment in CARVED:
         assert set(carve.exercise_files(assignment)) >= {f"test_{name}.py" for name in assignment.tests}
 

@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import threading
 import time
@@ -26,11 +25,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ..disk.files import shares
 from . import channel
 from .bugs import PACKAGE
 
 WORKER = Path(__file__).with_name("worker.py")
-HIDDEN = PACKAGE, Path(sysconfig.get_path("data"), "share", "hind4sight_min")  # the second: the shipped pokes' truth
+HIDDEN = PACKAGE, *shares()  # there lies the shipped pokes' truth
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,23 @@ import json
 import math
 import os
 import socket
-import zipfile
+import sysconfig
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+
+
+def shares():
+    """Where a plain install puts what is shipped beside the package: for the environment, for the user alone."""
+    return [Path(sysconfig.get_path("data", scheme), "share", "hind4sight_min")
+            for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme("user"))]
+
+
+def shipped(path):
+    """A file or folder that is shipped with the package: beside it in a clone, under share/ after a plain install."""
+    places = [folder / path for folder in (Path(__file__).resolve().parents[2], *shares())]
+    return next((place for place in places if place.exists()), places[0])
 
 
 @contextmanager

@@ -3,7 +3,6 @@ import argparse
 import json
 import os
 import sys
-import sysconfig
 import time
 from functools import partial
 from importlib.util import find_spec
@@ -13,7 +12,7 @@ import numpy as np
 
 from .. import __version__, planning, training
 from ..disk import checkpoints
-from ..disk.files import check_output, only_one, write_json
+from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.shards import load_interactions
 from ..networks import Sizes
 from ..sim.arena import Settings
@@ -29,11 +28,8 @@ from .runs import total, train_saving
 
 
 def data_small():
-    """The folder of the shipped data: beside the package in a clone, under share/ after a plain install."""
-    installed = [Path(sysconfig.get_path("data", scheme)) / "share" / "hind4sight_min" / "data_small"
-                 for scheme in (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme("user"))]
-    clone = Path(__file__).resolve().parents[2] / "data_small"
-    return next((folder for folder in (clone, *installed) if folder.is_dir()), clone)
+    """The folder of the shipped data."""
+    return shipped("data_small")
 
 
 # --- what is printed -------------------------------------------------------------------------------------
