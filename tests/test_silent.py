@@ -264,6 +264,7 @@ def test_a_run_that_diverges_says_when_and_what_to_try(tmp_path):
 def program(*arguments, **how):
     """The command in a process of its own."""
     how["env"] = {**os.environ, "PYTHONPATH": str(ROOT), **how.get("env", {})}
+    how.setdefault("preexec_fn", lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))  # in a shell's background off
     return subprocess.Popen([sys.executable, "-m", "hind4sight_min", *map(str, arguments)], text=True,
                             **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **how})
 
