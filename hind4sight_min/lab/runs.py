@@ -33,6 +33,24 @@ def total(terms, recipe, step):
     return sum(weight * terms.get(name, 0.0) for name, weight in recipe_at(recipe, step).weights.items())
 
 
+def end_epoch(run, path):
+    """Close an epoch: its means go into the run's log, and the log as CSV beside `path` -> the new entry."""
+    log, sums = run.meta["log"], run.meta["sums"]
+    steps = run.step - (log[-1]["step"] if log else 0)
+    log.append({"epoch": len(log) + 1, "step": run.step, "learning_rate": learning_rate(run.recipe, run.step - 1),
+                **{name: total / steps for name, total in sums.items()}})
+    sums.clear()
+    rows = [",".join(log[0]), *(",".join(f"{value:g}" for value in entry.values()) for entry in log)]
+    write_text(Path(path).with_suffix(".csv"), "\n".join(rows) + "\n")
+    return log[-1]
+
+
+def kept(run):
+    """The run as it is, apart from what the next step changes in place."""
+    return replace(run, first_moment=run.first_moment.copy(), second_moment=run.second_moment.copy(),
+                   meta={**run.meta, "log": [*run.meta["log"]], "sums": dict(run.meta["sums"])})
+
+
 def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, on_epoch=None, save_every=60.0):
     """`train` with a log, and a checkpoint at `path` every `save_every` seconds and at its end, however it ends, unless
     it diverged -> the log.
@@ -58,28 +76,16 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
         whole.meta["seconds"] = meta["seconds"] = before + saved - began
         save_run(path, whole)
 
-    def kept():  # the run as it is, apart from what the next step changes in place
-        return replace(run, first_moment=run.first_moment.copy(), second_moment=run.second_moment.copy(),
-                       meta={**meta, "log": [*log], "sums": dict(sums)})
-
-    whole = kept()  # after the last step
-
-    def end_epoch():
-        steps = run.step - (log[-1]["step"] if log else 0)
-        log.append({"epoch": len(log) + 1, "step": run.step, "learning_rate": learning_rate(recipe, run.step - 1),
-                    **{name: total / steps for name, total in sums.items()}})
-        sums.clear()
-        rows = [",".join(log[0]), *(",".join(f"{value:g}" for value in entry.values()) for entry in log)]
-        write_text(Path(path).with_suffix(".csv"), "\n".join(rows) + "\n")
-        if on_epoch:
-            on_epoch(log[-1])
+    whole = kept(run)  # after the last step
 
     def step_done(run, terms):
         nonlocal whole
         sums.update((name, sums.get(name, 0.0) + value) for name, value in terms.items())
         if run.step % per_epoch == 0 or run.step == recipe.steps:
-            end_epoch()
-        whole = kept()  # after the log entry: what is saved must not lack it
+            entry = end_epoch(run, path)
+            if on_epoch:
+                on_epoch(entry)
+        whole = kept(run)  # after the log entry: what is saved must not lack it
         if on_step:
             on_step(run, terms)
         if time.perf_counter() - saved > save_every:
