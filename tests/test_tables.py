@@ -52,17 +52,18 @@ def test_every_model_is_trained_with_its_own_terms_for_the_same_budget(model):
         assert noisy.keywords == {"window": window, "depth_noise": 0.01}
 
 
-def test_training_test_and_unseen_pokes_are_three_things(tmp_path, monkeypatch):
+def test_no_test_shares_a_seed_with_another_and_only_unseen_has_what_was_held_out(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
     calls = {}
     monkeypatch.setattr(tables, "collect", lambda folder, *given: calls.update({folder.name: given}))
     tables.collect_data(tmp_path, tables.FULL)
-    assert {name: call[0] for name, call in calls.items()} == {"train": 24000, "test": 1000, "unseen": 1000}
-    assert len({call[1] for call in calls.values()}) == 3, "two of them have the same seed"
+    pokes = {"train": 48000, "test": 1000, "unseen": 4000, "known": 4000, "all_over": 1000, "crowded": 1000}
+    assert {name: call[0] for name, call in calls.items()} == pokes
+    assert len({call[1] for call in calls.values()}) == len(calls), "two of them have the same seed"
     for kind in ("kinds", "textures"):
         drawn = {name: set(getattr(call[2], kind)) for name, call in calls.items()}
-        assert drawn["unseen"] == set(HELD_OUT[kind])
-        assert drawn["train"] == drawn["test"] and not drawn["train"] & drawn["unseen"]
+        assert drawn["unseen"] == set(HELD_OUT[kind]) and not drawn["train"] & drawn["unseen"]
+        assert drawn["test"] == drawn["known"] <= drawn["train"] == drawn["all_over"]
 
 
 # --- runs that go on ----------------------------------------------------------------------------------------------
@@ -71,7 +72,7 @@ def test_a_cell_goes_on_where_it_was_and_is_run_once(tmp_path, small_world, monk
     cell = Cell("full", "clean", 1, long=True)
     whole = tables.run_cell(cell, tmp_path / "whole", TINY_SCALE)
     assert whole["train_seconds"] > 0 and "unseen_flow_mse_ratio" in whole
-    assert small_world == ["train", "test", "unseen"], "trained on the one, evaluated on the others"
+    assert small_world == ["train", *tables.TESTS], "trained on the one, evaluated on the others"
     save, parts = runs.save_run, tmp_path / "parts" / "cells"
 
     def stop_at_two(path, run):

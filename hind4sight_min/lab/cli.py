@@ -15,7 +15,7 @@ from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.shards import load_interactions
 from ..networks import Sizes
-from ..sim.arena import Settings
+from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import find_truth
@@ -255,9 +255,12 @@ def run_demo(args):
 
     jobs = "--jobs", args.jobs
     if simulating:
+        scenes = ("--objects", Settings.objects_min, MIDDLE["objects_max"], "--within", MIDDLE["place_within"],
+                  "--kinds", *MIDDLE["kinds"])
         run("Simulate pokes: before, after, and the poke alone.",
-            "collect", train, "--pokes", DEMO_POKES, "--seed", args.seed, *jobs)
-        run("Some more, to test with.", "collect", test, "--pokes", DEMO_TEST_POKES, "--seed", args.seed + 1, *jobs)
+            "collect", train, "--pokes", DEMO_POKES, "--seed", args.seed, *scenes, *jobs)
+        run("Some more, to test with.",
+            "collect", test, "--pokes", DEMO_TEST_POKES, "--seed", args.seed + 1, *scenes, *jobs)
     else:
         print(NO_BULLET)
     for ending in (".npz", ".csv", ".png"):

@@ -19,12 +19,12 @@ from ..networks import predict
 from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll,
                         view_of)
 from ..scene import scene_of
-from ..sim.arena import Arena, Settings
+from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
 from ..training import check_camera
 from .marks import follow, places_at, points_at
 
-SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
+SETTINGS = Settings(**{**MIDDLE, "place_within": 0.56})  # so that the finger gets behind every object
 IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 REACHED = 0.4  # cost below which the goal counts as reached: less than followed marks and pixels can tell
