@@ -33,7 +33,7 @@ class Scale:
     train_pokes: int = 48000
     test_pokes: int = 1000
     steps: int = 3000
-    long_steps: int = 20000
+    long_steps: int = 30000
     seeds: tuple = (1, 2, 3)
 
 
