@@ -157,17 +157,28 @@ def keep(folder, kept=CELLS):
     """Add the finished cells of `hind4sight reproduce --out folder` to those that are kept -> how many there are."""
     cells = json.loads(kept.read_text()) if kept.exists() else {}
     cells.update((path.stem, json.loads(path.read_text())) for path in Path(folder).glob("cells/*.json"))
-    write_json(kept, cells)
+    write_json(kept, of_today(cells))
     return len(cells)
 
 
 def restore(folder, kept=CELLS):
     """Put the kept cells where `hind4sight reproduce --out folder` looks for finished ones -> how many were missing."""
-    cells = {Path(folder) / "cells" / f"{name}.json": cell for name, cell in json.loads(kept.read_text()).items()}
+    cells = of_today(json.loads(kept.read_text()))
+    cells = {Path(folder) / "cells" / f"{name}.json": cell for name, cell in cells.items()}
     missing = {path: cell for path, cell in cells.items() if not path.exists()}
     for path, cell in missing.items():
         write_json(path, cell)
     return len(missing)
+
+
+def of_today(cells):
+    """These cells {name: file's contents}; a ValueError where one is not as `hind4sight reproduce` would make it now."""
+    now = {cell.name: tables.ingredients(cell, tables.FULL)
+           for cell in tables.cells_of_tables(list(tables.TABLES), tables.FULL)}
+    for name, cell in cells.items():
+        if name not in now or not tables.made_of(cell, now[name]):
+            raise ValueError(f"cell {name}: made with another recipe, network or data than today's; remove it")
+    return cells
 
 
 def recorded(name):

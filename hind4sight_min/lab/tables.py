@@ -80,6 +80,11 @@ class Cell:
         """What the runs of all seeds have in common, as the figures' names say it."""
         return f"{self.model}_{self.noise}" + ("_long" if self.long else "")
 
+    @property
+    def name(self):
+        """As its file is called."""
+        return f"{self.group}-{self.seed}"
+
 
 def cells_of_tables(tables, scale):
     """The cells that some tables need, each once; the long runs of the full model are the headlines of all of them."""
@@ -110,13 +115,14 @@ def objective_of(cell):
 # so its objects: no scene of the control experiment has it.
 TRAIN_SEED = 5
 
+# folder -> (seed, Settings): training pokes, test pokes, and test pokes of objects and textures never trained on
+DATA = {"train": (TRAIN_SEED, Settings()), "test": (101, Settings()), "unseen": (102, Settings(**HELD_OUT))}
+
 
 def collect_data(out, scale, map=map, progress=None):
-    """Training pokes, test pokes, and test pokes of objects and textures never trained on; completes what is there."""
-    for name, pokes, seed, settings in (("train", scale.train_pokes, TRAIN_SEED, Settings()),
-                                        ("test", scale.test_pokes, 101, Settings()),
-                                        ("unseen", scale.test_pokes, 102, Settings(**HELD_OUT))):
-        collect(out / name, pokes, seed, settings, map, progress)
+    """Collect DATA; completes what is there."""
+    for name, (seed, settings) in DATA.items():
+        collect(out / name, scale.train_pokes if name == "train" else scale.test_pokes, seed, settings, map, progress)
 
 
 @lru_cache(maxsize=4)
@@ -145,9 +151,23 @@ def once(path, made, compute):
         began_at = commit()
         write_json(path, {**made, "metrics": compute(), "commit": began_at})
     found = json.loads(path.read_text())
-    if any(found.get(name) != value for name, value in made.items()):
-        raise ValueError(f"{path}: made with another recipe, network or search; remove it, or choose another --out")
+    if not made_of(found, made):
+        raise ValueError(f"{path}: made with another recipe, network, data or search; remove it, or choose another "
+                         "--out")
     return found["metrics"]
+
+
+def made_of(found, made):
+    """Whether the figures of a file, as `once` wrote it, were made of this."""
+    return all(found.get(name) == value for name, value in made.items())
+
+
+def ingredients(cell, scale):
+    """All that decides the figures of a cell, in plain JSON types, as `once` keeps it."""
+    data = {name: (seed, asdict(settings)) for name, (seed, settings) in DATA.items()}
+    return plain({"recipe": asdict(recipe_of(cell, scale)), "window": MODELS[cell.model][2],
+                  "depth_noise": NOISES[cell.noise], "format": checkpoints.FORMAT, "data": data,
+                  "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes})
 
 
 def run_cell(cell, out, scale, save_every=60.0):
@@ -155,7 +175,7 @@ def run_cell(cell, out, scale, save_every=60.0):
 
     `python docs/results.py keep` collects the files of what is finished.
     """
-    path, recipe, noise = out / "cells" / f"{cell.group}-{cell.seed}.npz", recipe_of(cell, scale), NOISES[cell.noise]
+    path, recipe, noise = out / "cells" / f"{cell.name}.npz", recipe_of(cell, scale), NOISES[cell.noise]
     window = MODELS[cell.model][2]
 
     def compute():
@@ -171,9 +191,7 @@ def run_cell(cell, out, scale, save_every=60.0):
             metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
         return {**metrics, "train_seconds": run.meta["seconds"]}
 
-    return once(path.with_suffix(".json"), {
-        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": checkpoints.FORMAT,
-        "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes}, compute)
+    return once(path.with_suffix(".json"), ingredients(cell, scale), compute)
 
 
 # --- all of them ------------------------------------------------------------------------------------------------
