@@ -96,6 +96,12 @@ HEADLINES = {
                       "{:.2f}", "<= 0.20"),
     "plan_2_objects": ("planning", "learned_2_left", "planning, 2 objects", "{:.2f}", "<= 0.30"),
     "plan_3_objects": ("planning", "learned_3_left", "planning, 3 objects", "{:.2f}", "<= 0.45"),
+    "plan_worst_scene": ("planning", "plan_worst_scene", "planning: distance left in the worst scene", "{:.2f}",
+                         "<= 0.35"),
+    "plan_turn_1_object_deg": ("planning", "learned_1_angle_deg", "planning, 1 object: median orientation left, deg",
+                               "{:.0f}", "<= 12"),
+    "obstacle_left_alone": ("planning", "learned_obstacle_avoided", "planning: share of runs that leave an obstacle alone",
+                            "{:.2f}", ">= 0.60"),
     "plan_over_oracle": ("planning", "plan_over_oracle", "planning: distance left / with the simulator as the model",
                          "{:.2f}", "<= 1.3"),
     "plan_step_seconds": ("planning_step", "plan_step_seconds", "planning: seconds per step", "{:.2f}", "< 2"),
@@ -157,17 +163,28 @@ def keep(folder, kept=CELLS):
     """Add the finished cells of `hind4sight reproduce --out folder` to those that are kept -> how many there are."""
     cells = json.loads(kept.read_text()) if kept.exists() else {}
     cells.update((path.stem, json.loads(path.read_text())) for path in Path(folder).glob("cells/*.json"))
-    write_json(kept, cells)
+    write_json(kept, of_today(cells))
     return len(cells)
 
 
 def restore(folder, kept=CELLS):
     """Put the kept cells where `hind4sight reproduce --out folder` looks for finished ones -> how many were missing."""
-    cells = {Path(folder) / "cells" / f"{name}.json": cell for name, cell in json.loads(kept.read_text()).items()}
+    cells = of_today(json.loads(kept.read_text()))
+    cells = {Path(folder) / "cells" / f"{name}.json": cell for name, cell in cells.items()}
     missing = {path: cell for path, cell in cells.items() if not path.exists()}
     for path, cell in missing.items():
         write_json(path, cell)
     return len(missing)
+
+
+def of_today(cells):
+    """These cells {name: file's contents}; a ValueError where one is not as `hind4sight reproduce` would make it now."""
+    now = {cell.name: tables.ingredients(cell, tables.FULL)
+           for cell in tables.cells_of_tables(list(tables.TABLES), tables.FULL)}
+    for name, cell in cells.items():
+        if name not in now or not tables.made_of(cell, now[name]):
+            raise ValueError(f"cell {name}: made with another recipe, network or data than today's; remove it")
+    return cells
 
 
 def recorded(name):

@@ -148,6 +148,7 @@ def test_plan_says_and_draws_what_it_did(own_goal, small, tmp_path, capsys):
                1, "--seed", 1, *goal, "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
     out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
     assert "poke 1 to (" in out and "cm from the goals" in out
+    assert found["plan_stopped"] == "the budget of pokes, 1, is spent" and f"stopped: {found['plan_stopped']}\n" in out
     assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
     assert (tmp_path / "plan.gif").read_bytes().startswith(b"GIF89a")
 

@@ -193,7 +193,7 @@ def record(distance):
     poses = np.zeros((len(distance), 7, 7))
     poses[1:, 1, 0], poses[1:-1, 2, 1] = 0.2, 0.03
     return {"poses": poses, "distance": np.array(distance)[:, None], "movers": np.array([1]), "pokes": np.zeros((2, 3)),
-            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1))}
+            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1)), "stopped": "no room"}
 
 
 def test_the_outcome_of_a_run_by_hand():
@@ -201,6 +201,7 @@ def test_the_outcome_of_a_run_by_hand():
     assert found["distance_m"] == pytest.approx([0.12, 0.02] + [0.05] * 9), "the present distance, not the best so far"
     assert found["others_shifted_m"] == pytest.approx(0.03), "of what was not to be moved, at its farthest"
     np.testing.assert_allclose(found["angles_deg"], [[40], [10]])
+    assert found["stopped"] == "no room"
 
 
 def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypatch):
@@ -246,6 +247,7 @@ def test_summary_of_the_control_experiment_by_hand():
     figures, curves = tables.summarise_planning(found)
     assert curves["learned", 1].shape == (2, 11)
     for name, value in {"learned_2_left": 0.06 / 0.4, "learned_2_left_sd": (0.4 - 0.02 / 0.3) / np.sqrt(2),
+                        "learned_2_worst": 0.4, "plan_worst_scene": 0.4,
                         "plan_over_oracle": 2, "learned_1_angle_start_deg": 20, "learned_1_angle_deg": 8,
                         "learned_obstacle_avoided": 2 / 3, "greedy_obstacle_avoided": 1 / 3,
                         "greedy_obstacle_shift_cm": 5 / 3}.items():

@@ -230,8 +230,10 @@ def run_plan(args):
         print(f"  poke {t + 1} to ({poke[0]:6.3f}, {poke[1]:6.3f}) m, direction {np.degrees(poke[2]):4.0f} deg: "
               f"{100 * distance[t]:5.1f} -> {100 * distance[t + 1]:5.1f} cm from the goals{done}")
     figures.save_sequence(path, record, task.arena.camera)
+    print(f"  stopped: {record['stopped']}")
     print(f"{path}: {len(distance) - 1} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
-    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0])})
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0]),
+                           "plan_stopped": record["stopped"]})
 
 
 # --- the demo ----------------------------------------------------------------------------------------------

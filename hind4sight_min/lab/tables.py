@@ -80,6 +80,11 @@ class Cell:
         """What the runs of all seeds have in common, as the figures' names say it."""
         return f"{self.model}_{self.noise}" + ("_long" if self.long else "")
 
+    @property
+    def name(self):
+        """As its file is called."""
+        return f"{self.group}-{self.seed}"
+
 
 def cells_of_tables(tables, scale):
     """The cells that some tables need, each once; the long runs of the full model are the headlines of all of them."""
@@ -155,9 +160,24 @@ def once(path, made, compute):
         began_at = commit()
         write_json(path, {**made, "metrics": compute(), "commit": began_at})
     found = json.loads(path.read_text())
-    if any(found.get(name) != value for name, value in made.items()):
-        raise ValueError(f"{path}: made with another recipe, network or search; remove it, or choose another --out")
+    if not made_of(found, made):
+        raise ValueError(f"{path}: made with another recipe, network, data or search; remove it, or choose another "
+                         "--out")
     return found["metrics"]
+
+
+def made_of(found, made):
+    """Whether the figures of a file, as `once` wrote it, were made of this."""
+    return all(found.get(name) == value for name, value in made.items())
+
+
+def ingredients(cell, scale):
+    """All that decides the figures of a cell, in plain JSON types, as `once` keeps it."""
+    data = {"train": (TRAIN_SEED, asdict(Settings()), scale.train_pokes),
+            **{name: (seed, asdict(settings), times * scale.test_pokes)
+               for name, (seed, settings, times) in TESTS.items()}}
+    return plain({"recipe": asdict(recipe_of(cell, scale)), "window": MODELS[cell.model][2],
+                  "depth_noise": NOISES[cell.noise], "format": checkpoints.FORMAT, "data": data})
 
 
 def run_cell(cell, out, scale, save_every=60.0):
@@ -165,7 +185,7 @@ def run_cell(cell, out, scale, save_every=60.0):
 
     `python docs/results.py keep` collects the files of what is finished.
     """
-    path, recipe, noise = out / "cells" / f"{cell.group}-{cell.seed}.npz", recipe_of(cell, scale), NOISES[cell.noise]
+    path, recipe, noise = out / "cells" / f"{cell.name}.npz", recipe_of(cell, scale), NOISES[cell.noise]
     window = MODELS[cell.model][2]
 
     def compute():
@@ -182,9 +202,7 @@ def run_cell(cell, out, scale, save_every=60.0):
                 metrics.update({f"{test}_{name}": value for name, value in found.items()})
         return {**metrics, "train_seconds": run.meta["seconds"]}
 
-    return once(path.with_suffix(".json"), {
-        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": checkpoints.FORMAT,
-        "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes}, compute)
+    return once(path.with_suffix(".json"), ingredients(cell, scale), compute)
 
 
 # --- all of them ------------------------------------------------------------------------------------------------
@@ -289,7 +307,6 @@ PLANNERS = {
 OBJECTS, POKES = (1, 2, 3), 10
 OBSTACLE_SCENES, OBSTACLE_TRIES = 3, 5
 AVOIDED = 0.01  # m; an obstacle that was moved by less was avoided
-AHEAD = {"horizon": 2, "candidates": 128}  # getting around an obstacle takes more than one poke
 
 
 def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
@@ -297,8 +314,10 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     planner: of PLANNERS, or "greedy"; movers 0: an obstacle scene. attempt: another one has other random numbers.
     """
-    _, policy, changes = PLANNERS.get(planner, ("", planner, {})) if movers else ("", planner, AHEAD)
+    _, policy, changes = PLANNERS.get(planner, ("", planner, {}))
     run, search = checkpoints.load_run(checkpoint), planning.Search(**changes)
+    if not movers:
+        search = control.two_ahead(search)  # getting around an obstacle takes more than one poke
 
     def compute():
         with control.random_task(seed, max(movers, 1), movers == 0, control.settings_for(run)) as task:
@@ -312,13 +331,13 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 def outcome(record):
     """What the tables need of a record of `control.closed_loop` -> dict. distance_m (POKES + 1): mean over the movers
     after every poke; others_shifted_m: the farthest that any other object was moved from its place; angles_deg: of
-    movers that are not round, at first and at last.
+    movers that are not round, at first and at last; stopped: why it ended.
     """
     distance, angles = record["distance"].mean(axis=1), record["angle"][[0, -1]]
     others = np.delete(record["poses"][..., :2], record["movers"], axis=1)
     return {"distance_m": np.pad(distance, (0, POKES + 1 - len(distance)), "edge").tolist(),  # it stopped: all stays
             "others_shifted_m": float(np.linalg.norm(others - others[0], axis=2).max()),
-            "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist()}
+            "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist(), "stopped": record["stopped"]}
 
 
 def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
@@ -342,7 +361,8 @@ def summarise_planning(results):
     figures, curves = {}, {}
     for planner, movers in product(PLANNERS, OBJECTS):
         curve = curves[planner, movers] = np.array([each["distance_m"] for each in of(planner, movers)])
-        found = {"left": curve[:, -1].mean() / curve[:, 0].mean(), "left_sd": (curve[:, -1] / curve[:, 0]).std(ddof=1)}
+        left = curve[:, -1] / curve[:, 0]
+        found = {"left": curve[:, -1].mean() / curve[:, 0].mean(), "left_sd": left.std(ddof=1), "worst": left.max()}
         start, end = (np.concatenate([each["angles_deg"][i] for each in of(planner, movers)]) for i in (0, 1))
         if len(start):
             found.update(angle_start_deg=np.median(start), angle_deg=np.median(end))
@@ -350,6 +370,7 @@ def summarise_planning(results):
     learned, oracle = (sum(curves[planner, movers][:, -1].mean() for movers in OBJECTS)
                        for planner in ("learned", "oracle"))
     figures["plan_over_oracle"] = float(learned / oracle)
+    figures["plan_worst_scene"] = max(figures[f"learned_{movers}_worst"] for movers in OBJECTS)
     for planner in ("learned", "greedy"):
         shifts = np.array([each["others_shifted_m"] for each in of(planner, 0)])
         figures[f"{planner}_obstacle_avoided"] = float(np.mean(shifts < AVOIDED))
