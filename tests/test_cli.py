@@ -124,6 +124,14 @@ def test_evaluate_shows_the_pokes_with_the_faults_asked_for(small, tmp_path, cap
     one_line(capsys, run("evaluate", small / "checkpoint.npz", small / "train", "--missing", "rim"), "missing", "rims")
 
 
+def test_camera_is_the_shipped_checkpoint_for_cameras():
+    parse = cli.build_parser().parse_args
+    for command in ("evaluate", "show", "plan"):
+        assert parse([command, "camera"]).checkpoint == data_small() / "camera_checkpoint.npz"
+        assert parse([command, "runs/camera"]).checkpoint == Path("runs/camera")
+        assert parse([command]).checkpoint == data_small() / "checkpoint.npz"
+
+
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
     run, data = checkpoints.load_run(data_small() / "checkpoint.npz"), load_interactions(data_small() / "test")[:40]
     _, gradient = training.chunk_gradient(training.unsupervised, run.vector, run.layout, run.recipe, data, [0])

@@ -324,7 +324,13 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz"}
+def checkpoint_path(text):
+    """A file's path, or 'camera' -> that of the shipped checkpoint for real cameras."""
+    return data_small() / "camera_checkpoint.npz" if text == "camera" else Path(text)
+
+
+SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz", "type": checkpoint_path,
+           "help": "a file, or camera: the shipped one for real cameras"}
 TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
