@@ -40,6 +40,10 @@ def measure(checkpoint, folder, row):
     return {name: found[name] for name in METRICS}
 
 
+def line_of(*cells):
+    return f"| {' | '.join(cells)} |"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", default=DATA / "test")
@@ -47,12 +51,14 @@ def main():
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", metavar="FILE", help="write the figures here too")
     args, figures = parser.parse_args(), {}
-    print(" | ".join(["fault", *(text for text, _ in METRICS.values())]))
+    table = [line_of("fault", *(text for text, _ in METRICS.values())), "|---" * (1 + len(METRICS)) + "|"]
+    print(*table, sep="\n", flush=True)
     with parallel_map(args.jobs) as map:
         for (row, (text, _)), found in zip(ROWS.items(), map(partial(measure, args.checkpoint, args.data), ROWS)):
-            print(" | ".join([text, *(form.format(found[name]) for name, (_, form) in METRICS.items())]), flush=True)
+            table.append(line_of(text, *(form.format(found[name]) for name, (_, form) in METRICS.items())))
+            print(table[-1], flush=True)
             figures.update({f"camera_{row}_{name}": value for name, value in found.items()})
-    write_json(args.json, figures)
+    write_json(args.json, {**figures, "table": "\n".join(table)})
 
 
 if __name__ == "__main__":

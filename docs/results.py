@@ -288,9 +288,9 @@ def control_table():
             f"pushing straight at the goal does in {obstacle[1]}.")
 
 
-def left_out_table():
-    """What each addition brings, once `benchmarks/leave_one_out.py` is recorded."""
-    figures = recorded("leave_one_out")
+def table_of(name):
+    """The table of a benchmark that makes one, once it is recorded."""
+    figures = recorded(name)
     return figures["table"] if figures else "Not recorded yet."
 
 
@@ -298,8 +298,8 @@ def pages(summary):
     """{page: {marker: what stands between `<!-- marker: ... -->` and `<!-- /marker -->`}}."""
     return {ROOT / "README.md": {"figures": table(summary, FRONT)},
             ROOT / "docs" / "results.md": {"figures": table(summary), "tables": paper_tables(),
-                                           "control": control_table()},
-            ROOT / "docs" / "not-in-the-paper.md": {"left out": left_out_table()}}
+                                           "control": control_table(), "cameras": table_of("camera")},
+            ROOT / "docs" / "not-in-the-paper.md": {"left out": table_of("leave_one_out")}}
 
 
 def page_with(text, contents):
