@@ -1,14 +1,15 @@
 """Recorded results: run a command, keep its figures with where they came from, and put them into the README.
 
     python docs/results.py record shipped -- hind4sight evaluate
-    python docs/results.py ship runs/shipped.npz
+    python docs/results.py ship runs/shipped.npz          (runs/camera.npz camera)
     python docs/results.py keep runs/reproduce
     python docs/results.py restore runs/reproduce
     python docs/results.py summary
 
 `record NAME -- COMMAND` runs COMMAND with `--json` added and writes docs/results/NAME.json: the figures, the
 command, commit, versions, machine and duration. `ship CHECKPOINT` makes the checkpoint of the recorded result
-`training` the shipped one: without the optimiser's state, with its command and commit inside. The paper's tables take
+`training` the shipped one, `ship CHECKPOINT camera` that of `camera_training` the one for real cameras: without the
+optimiser's state, with its command and commit inside. The paper's tables take
 hours: `keep FOLDER` adds the cells that `hind4sight reproduce --out FOLDER` has finished to docs/results/cells.json,
 each with its recipe and commit, and `restore FOLDER` puts them back, so that another machine goes on. `summary` gathers
 the headline figures of all recorded results in docs/results/summary.json and writes the tables of README.md,
@@ -107,6 +108,23 @@ HEADLINES = {
     "plan_step_seconds": ("planning_step", "plan_step_seconds", "planning: seconds per step", "{:.2f}", "< 2"),
     "plan_candidates_per_second": ("planning_step", "plan_candidates_per_second", "planning: candidates per second",
                                    "{:.0f}", ""),
+    "camera_clean_flow_mse_ratio": ("camera", "camera_clean_flow_mse_ratio",
+                                    "camera checkpoint, no fault: squared flow error / no motion", "{:.3f}",
+                                    "<= 0.110"),
+    "camera_noisy_flow_mse_ratio": ("camera", "camera_noisy_flow_mse_ratio", "camera checkpoint, 1 cm of depth noise",
+                                    "{:.3f}", "<= 0.125"),
+    "camera_noisy_direction_deg": ("camera", "camera_noisy_inverse_direction_deg",
+                                   "camera checkpoint, 1 cm of depth noise: median direction error, deg", "{:.1f}",
+                                   "<= 17"),
+    "camera_missing30_flow_mse_ratio": ("camera", "camera_missing30_flow_mse_ratio",
+                                        "camera checkpoint, 30 % of the depth missing at random", "{:.3f}",
+                                        "<= 0.160"),
+    "camera_shadow_mask_iou": ("camera", "camera_shadow_mask_iou",
+                               "camera checkpoint, rims and shadows missing on one side: IoU", "{:.2f}", ">= 0.75"),
+    "camera_pitch1_flow_mse_ratio": ("camera", "camera_pitch1_flow_mse_ratio",
+                                     "camera checkpoint, pitch wrong by 1 degree", "{:.3f}", "<= 0.200"),
+    "camera_shift1_flow_mse_ratio": ("camera", "camera_shift1_flow_mse_ratio",
+                                     "camera checkpoint, pose wrong by 1 cm", "{:.3f}", "<= 0.140"),
     "import_seconds": ("startup", "import_seconds", "import, seconds", "{:.2f}", "< 0.7"),
     "planted_faults_caught": ("planted_faults", "planted_faults_caught", "planted faults that the tests catch, of 80",
                               "{:.0f}", ">= 76"),
@@ -149,12 +167,12 @@ def record(name, command):
     write_text(RESULTS / f"{name}.json", json.dumps(result, indent=2, sort_keys=True) + "\n")
 
 
-def ship(checkpoint, target=ROOT / "data_small" / "checkpoint.npz"):
-    """Write a finished checkpoint in the form that is shipped."""
+def ship(checkpoint, target=ROOT / "data_small" / "checkpoint.npz", recorded="training"):
+    """Write a finished checkpoint, that of a recorded training, in the form that is shipped."""
     run = load_run(checkpoint)
     if run.step < run.recipe.steps:
         raise ValueError(f"{checkpoint}: training stopped at step {run.step} of {run.recipe.steps}")
-    training = json.loads((RESULTS / "training.json").read_text())
+    training = json.loads((RESULTS / f"{recorded}.json").read_text())
     run.meta.update(command=training["command"], commit=training["commit"])
     save_run(target, run, resumable=False)
 
@@ -287,9 +305,9 @@ def control_table():
             f"pushing straight at the goal does in {obstacle[1]}.")
 
 
-def left_out_table():
-    """What each addition brings, once `benchmarks/leave_one_out.py` is recorded."""
-    figures = recorded("leave_one_out")
+def table_of(name):
+    """The table of a benchmark that makes one, once it is recorded."""
+    figures = recorded(name)
     return figures["table"] if figures else "Not recorded yet."
 
 
@@ -297,8 +315,8 @@ def pages(summary):
     """{page: {marker: what stands between `<!-- marker: ... -->` and `<!-- /marker -->`}}."""
     return {ROOT / "README.md": {"figures": table(summary, FRONT)},
             ROOT / "docs" / "results.md": {"figures": table(summary), "tables": paper_tables(),
-                                           "control": control_table()},
-            ROOT / "docs" / "not-in-the-paper.md": {"left out": left_out_table()}}
+                                           "control": control_table(), "cameras": table_of("camera")},
+            ROOT / "docs" / "not-in-the-paper.md": {"left out": table_of("leave_one_out")}}
 
 
 def page_with(text, contents):
@@ -316,6 +334,8 @@ def main(arguments):
         record(arguments[1], arguments[3:])
     elif arguments[:1] == ["ship"] and len(arguments) == 2:
         ship(arguments[1])
+    elif arguments[:1] == ["ship"] and arguments[2:] == ["camera"]:
+        ship(arguments[1], ROOT / "data_small" / "camera_checkpoint.npz", "camera_training")
     elif arguments[:1] == ["keep"] and len(arguments) == 2:
         print(f"{keep(arguments[1])} cells are kept in {CELLS.relative_to(ROOT)}")
     elif arguments[:1] == ["restore"] and len(arguments) == 2:

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from hind4sight_min.disk.shards import load_interactions, save_shard
+from hind4sight_min.sim.truth import load_truth, save_truth
+
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = {  # benchmark -> what it needs, its arguments, figures that must be among those it records
     "startup": ((), (), ("import_seconds", "import_command_line_seconds", "first_picture_seconds_max")),
@@ -48,3 +51,16 @@ def test_all_eighty_planted_faults_still_fit_the_source():
     for fault in planted.FAULTS:
         planted.with_fault(fault)  # raises where its text is not there once, or no Python comes of it
         assert all((ROOT / "tests" / f"test_{name}.py").exists() for name in fault.tests.split()), fault.name
+
+
+def test_the_table_of_camera_faults_runs(tmp_path):
+    test = ROOT / "data_small" / "test"
+    save_shard(tmp_path / "shard_0000.npz", load_interactions(test)[:6])
+    save_truth(tmp_path / "shard_0000.npz", load_truth(test)[:6])
+    command = [sys.executable, ROOT / "benchmarks" / "camera_faults.py", tmp_path, "--json", tmp_path / "figures.json",
+               "--checkpoint", ROOT / "data_small" / "checkpoint.npz"]
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures.pop("table").count("\n") == 1 + 7
+    assert {f"camera_{row}_flow_mse_ratio" for row in ("clean", "noisy", "missing30", "pitch1", "shift1")} <= set(figures)
+    assert len(set(figures.values())) == len(figures), "rows that are the same: is a fault not passed on?"

@@ -28,18 +28,22 @@ def test_summary_is_made_of_the_recorded_results():
     assert all(isinstance(value, float) for value in summary.values())
 
 
-def test_the_shipped_checkpoint_says_how_it_was_trained(tmp_path):
-    shipped = ROOT / "data_small" / "checkpoint.npz"
-    run, recorded = load_run(shipped), json.loads((ROOT / "docs" / "results" / "training.json").read_text())
+@pytest.mark.parametrize("name, training", [("checkpoint", "training"), ("camera_checkpoint", "camera_training")])
+def test_a_shipped_checkpoint_says_how_it_was_trained(name, training, tmp_path):
+    shipped = ROOT / "data_small" / f"{name}.npz"
+    if not shipped.exists():
+        pytest.skip("not shipped yet")
+    run, recorded = load_run(shipped), json.loads((ROOT / "docs" / "results" / f"{training}.json").read_text())
+    assert bool(run.meta.get("camera_faults")) == (name == "camera_checkpoint")
     assert (run.meta["command"], run.meta["commit"]) == (recorded["command"], recorded["commit"])
     assert run.step == run.recipe.steps == recorded["figures"]["loss_step"]
-    results.ship(shipped, tmp_path / "again.npz")
+    results.ship(shipped, tmp_path / "again.npz", training)
     again = load_run(tmp_path / "again.npz")
     assert (again.vector == run.vector).all() and again.recipe == run.recipe and not again.first_moment.any()
     run.step -= 1
     save_run(tmp_path / "unfinished.npz", run)
     with pytest.raises(ValueError, match="stopped at step"):
-        results.ship(tmp_path / "unfinished.npz", tmp_path / "never.npz")
+        results.ship(tmp_path / "unfinished.npz", tmp_path / "never.npz", training)
     assert not (tmp_path / "never.npz").exists()
 
 

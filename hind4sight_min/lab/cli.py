@@ -20,6 +20,7 @@ from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import find_truth
 from . import contact, control, evaluation, tables
+from .camera_faults import ONE_SIDED, under_faults
 from .noise import under_noise
 from .processes import parallel_map
 from .runs import total, train_saving
@@ -105,13 +106,24 @@ def run_collect(args):
     write_json(args.json, {"collect_seconds": seconds, **{f"pokes_{name}": count for name, count in counts.items()}})
 
 
-def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, **given):
+def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, camera_faults=False,
+            **given):
     """A fresh Run as the options of `train` say."""
+    if depth_noise and camera_faults:
+        raise ValueError("--depth-noise: --camera-faults has a noise of its own")
     recipe = training.Recipe(**given, sizes=Sizes(masks=masks, width=width),
                              weights={**training.WEIGHTS, **dict(weight)})
     run = training.start_run(recipe, interactions)
-    run.meta["depth_noise"] = depth_noise
+    run.meta.update(depth_noise=depth_noise, camera_faults=camera_faults)
     return run
+
+
+def objective_of(run):
+    """What a run minimises, as the options of `train` said."""
+    if run.meta.get("camera_faults"):
+        return under_faults
+    noise = run.meta.get("depth_noise")
+    return partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
 
 
 def run_train(args):
@@ -143,9 +155,7 @@ def run_train(args):
         note = "; in brackets: without motion" if entry["epoch"] == 1 else ""
         print(f"epoch {entry['epoch']}, step {entry['step']}: {terms}{note}", flush=True)
 
-    noise = run.meta.get("depth_noise")
-    objective = partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
-    log = train_saving(interactions, run, out, objective, args.jobs, on_step, on_epoch)
+    log = train_saving(interactions, run, out, objective_of(run), args.jobs, on_step, on_epoch)
     log = [{**entry, "total": total(entry, run.recipe, entry["step"] - 1)} for entry in log]
     still = summed(run.meta["no_motion"])
     figures.save_figure(figures.training_figure(log, still), out.with_suffix(".png"))
@@ -163,7 +173,8 @@ def run_evaluate(args):
     folder_alone(args)
     run, interactions = checkpoints.load_run(args.checkpoint), load_interactions(args.data)
     truth = find_truth(args.data)
-    metrics = evaluation.evaluate(run, interactions, truth, progress_line("evaluate"))
+    faults = {name: value for name, value in vars(args).items() if value and f"--{name.replace('_', '-')}" in FAULTS}
+    metrics = evaluation.evaluate(run, interactions, truth, progress_line("evaluate"), **faults)
     print_label_free(metrics) if truth is None else print_metrics(metrics)
     write_json(args.json, metrics)
 
@@ -303,6 +314,14 @@ def term_weight(text):
     return name, float(value)
 
 
+def missing_kind(text):
+    """'0.3' -> 0.3, a share; a name stays one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 class OneLineParser(argparse.ArgumentParser):
     """argparse without the usage text before an error."""
 
@@ -310,7 +329,13 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz"}
+def checkpoint_path(text):
+    """A file's path, or 'camera' -> that of the shipped checkpoint for real cameras."""
+    return data_small() / "camera_checkpoint.npz" if text == "camera" else Path(text)
+
+
+SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz", "type": checkpoint_path,
+           "help": "a file, or camera: the shipped one for real cameras"}
 TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
@@ -321,6 +346,15 @@ def fields(record, *names, **how):
     """Options for some fields of a record of settings, which has their defaults."""
     return {"--" + name.replace("_", "-"): {"type": type(value), "default": value, "help": f"default {value}", **how}
             for name, value in vars(record).items() if name in names}
+
+
+FAULTS = {  # of the camera that `evaluate` shows the pokes with
+    "--depth-noise": {"type": float, "metavar": "SD", "help": "of the depth, in m"},
+    "--missing": {"type": missing_kind, "action": "append", "metavar": f"SHARE|{'|'.join(ONE_SIDED)}",
+                  "help": "depth that is missing: a share at random, rims, shadows; again for another"},
+    "--pitch-error": {"type": float, "metavar": "DEG", "help": "how wrong the camera's pitch is"},
+    "--pose-error": {"type": float, "nargs": 2, "metavar": ("DEG", "M"),
+                     "help": "how wrong its pose is: turned about any axis, shifted in any direction"}}
 
 
 COMMANDS = {  # name: what runs it, what it does, its arguments as argparse takes them
@@ -344,10 +378,12 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--weight": {"type": term_weight, "action": "append", "metavar": "TERM=VALUE",
                      "help": f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(training.WEIGHTS)}"},
         "--depth-noise": {"type": float, "help": "SD in m of the noise to train under (0)"},
+        "--camera-faults": {"action": "store_true", "default": None, "help": "train for real cameras: under noise, "
+                            "missing depth and an uncertain pose"},
         "--resume": {"action": "store_true", "help": "go on with the checkpoint OUT and its recipe"},
         "--jobs": JOBS, "--json": JSON}),
     "evaluate": (run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped ones", {
-        "checkpoint": SHIPPED, "data": TEST, "--json": JSON}),
+        "checkpoint": SHIPPED, "data": TEST, **FAULTS, "--json": JSON}),
     "show": (run_show, "one interaction as a picture; without arguments, a shipped one", {
         "checkpoint": SHIPPED, "data": TEST, "--out": {"default": "interaction.png"},
         "--row": {"type": int, "help": "which interaction (one that moves something well)"}}),
