@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import losses
-from ..geometry import optical_flow, unproject
+from ..geometry import Camera, optical_flow, unproject
 from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
 from ..scene import Scene, most_changed
 from ..sim.truth import true_scene_flow
-from ..training import check_camera, scenes_of
+from ..training import scenes_of
+from .cameras import check_camera
 from .noise import with_depth_noise
 
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
@@ -35,9 +36,9 @@ class Answer:
 
 def ask(run, interactions, row, depth_noise=0.0):
     """The whole model on one row of a data set -> Answer. depth_noise: SD in m of the noise it sees the depth with, the
-    same at every call, another for every row. Raises ValueError for another camera than the run was trained with.
+    same at every call, another for every row. Raises ValueError for a camera that cannot show the run its arena.
     """
-    check_camera(run, interactions.camera)
+    check_camera(interactions.camera, Camera(**run.meta["camera"]))
     one = interactions[[row]]
     if depth_noise:
         one = with_depth_noise(one, depth_noise, np.random.default_rng([0, row]))
