@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, train, evaluate, show, plan, demo, reproduce, course; `COMMAND --help`."""
+"""The `hind4sight` command: collect, import, train, evaluate, show, plan, demo and more; `COMMAND --help`."""
 import argparse
 import json
 import os
@@ -13,13 +13,14 @@ import numpy as np
 from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
-from ..disk.shards import load_interactions
+from ..disk.recordings import save_recording
+from ..disk.shards import each_shard, load_interactions
 from ..networks import Sizes
 from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import find_truth
-from . import contact, control, evaluation, tables
+from . import cameras, contact, control, evaluation, tables
 from .camera_faults import ONE_SIDED, under_faults
 from .noise import under_noise
 from .processes import parallel_map
@@ -104,6 +105,25 @@ def run_collect(args):
     dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
     print(f"{args.out}: {counts['kept']} pokes in {seconds:.1f} s; dropped: {dropped}")
     write_json(args.json, {"collect_seconds": seconds, **{f"pokes_{name}": count for name, count in counts.items()}})
+
+
+def run_import(args):
+    with only_one(args.out):
+        found = cameras.import_recording(args.folder, args.out, tuple(args.size), progress_line("import"))
+    camera = found.pop("camera")
+    pose, origin = camera.arena_from_camera, "as given" if np.isnan(found["table"]) else \
+        f"from the empty picture, of which {found['table']:.0%} is table"
+    print(f"{args.out}: {found['pokes']} pokes, {camera.width} x {camera.height} px\n"
+          f"  the camera's pose, {origin}: {pose[2, 3]:.3f} m above the table, looking down at "
+          f"{np.degrees(np.arcsin(-pose[2, 2])):.1f} degrees; a pixel is {1e3 * camera.pixel_size:.1f} mm wide there\n"
+          f"  {found['missing']:.0%} of the pixels have no depth; {found['met']:.0%} of the pokes end where something stands")
+    write_json(args.json, {f"import_{name}": value for name, value in found.items() if np.isfinite(value)})
+
+
+def run_export(args):
+    with only_one(args.folder):
+        count = save_recording(args.folder, each_shard(args.data))
+    print(f"{args.folder}: {count} pokes; 'hind4sight import' takes them back")
 
 
 def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, camera_faults=False,
@@ -370,6 +390,13 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--jobs": JOBS, "--json": JSON}),
+    "import": (run_import, "make a folder of shards from a real camera's recording: see docs/own-data.md", {
+        "folder": {"help": "of the recording: camera.json, pokes.csv and PNG pictures"},
+        "out": {"help": "folder to write the shards to"},
+        "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
+                   "help": "of the pictures to make, px"}, "--json": JSON}),
+    "export": (run_export, "write a folder of shards as a recording, at its size", {
+        "data": {"help": "folder of shards"}, "folder": {"help": "a new one, for the recording"}}),
     "train": (run_train, "train the full model (Eq. 6) on a folder of shards, without labels", {
         "data": {"nargs": "?", "default": data_small() / "train"},
         "out": {"help": "checkpoint to write (.npz); its log goes beside it (.csv and .png)"},

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import check_whole
-from ..geometry import project, unproject
+from ..geometry import Camera, project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
 from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll,
@@ -21,7 +21,7 @@ from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_
 from ..scene import scene_of
 from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
-from ..training import check_camera
+from .cameras import check_camera
 from .marks import follow, places_at, points_at
 
 SETTINGS = Settings(**{**MIDDLE, "place_within": 0.56})  # so that the finger gets behind every object
@@ -36,8 +36,9 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 # --- tasks --------------------------------------------------------------------------------------------------------
 
 def settings_for(run, settings=SETTINGS):
-    """Settings, those of the test scenes, in pictures of the size that a run was trained with."""
-    return replace(settings, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
+    """Settings, those of the test scenes, in pictures of the size that a run was trained with if they are 4:3."""
+    width, height = run.meta["camera"]["width"], run.meta["camera"]["height"]
+    return replace(settings, width=width, height=height) if 3 * width == 4 * height else settings
 
 
 @dataclass
@@ -259,14 +260,14 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     poke ahead sees no gain, it looks two ahead: of two objects that must swap one has to make room first.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance (T+1, M) m, angle
     (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task movers, goal_marks,
-    goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
+    goal_rgb. Raises ValueError for a camera that cannot show the run its arena, and NoPoke where not even the
     first poke is possible; later on that ends the loop, as an empty arena does.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
     check_whole("budget", budget, 1, 1000)
     arena, rng = task.arena, np.random.default_rng(seed)
-    check_camera(run, arena.camera)
+    check_camera(arena.camera, Camera(**run.meta["camera"]))
     (rgb, depth, labels), view, goal = first_look(task)
     states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
     stopped = f"the budget of pokes, {budget}, is spent"

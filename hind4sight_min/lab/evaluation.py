@@ -8,13 +8,14 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from .. import losses
-from ..geometry import optical_flow, unproject
+from ..geometry import Camera, optical_flow, unproject
 from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
 from ..scene import Scene, most_changed
 from ..sim.truth import true_scene_flow
-from ..training import check_camera, scenes_of
+from ..training import scenes_of
 from .camera_faults import prepared, with_faults
+from .cameras import check_camera
 
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
 AT_WALL = 0.012  # m; a poke ends at a wall where a point that it moved ends so near to one, about a pixel
@@ -37,9 +38,9 @@ class Answer:
 def ask(run, interactions, row, **faults):
     """The whole model on one row of a data set -> Answer. faults: of the camera that it sees the row with, as those of
     `camera_faults.with_faults`: the same at every call, others for every row. Pictures with faults, and all that a run
-    for real cameras is asked about, are `prepared` first. Raises ValueError for another camera than that of the run.
+    for real cameras is asked about, are `prepared` first. Raises ValueError for a camera that cannot show the run its arena.
     """
-    check_camera(run, interactions.camera)
+    check_camera(interactions.camera, Camera(**run.meta["camera"]))
     one = interactions[[row]]
     if any(faults.values()) or run.meta.get("camera_faults"):
         one = prepared(with_faults(one, np.random.default_rng([0, row]), **faults))
