@@ -111,14 +111,8 @@ def test_a_cell_is_trained_and_evaluated_under_its_noise(model, tmp_path, small_
     assert not np.array_equal(trained[0].vector, trained[1].vector)
 
 
-def test_tasks_are_spread_over_processes():
-    found = tables.run_all(divmod, [(7, 3), (9, 2)], 1)
-    assert list(found) == [((7, 3), (2, 1)), ((9, 2), (4, 1))]
-
-
 def test_all_together(tmp_path, small_world, monkeypatch, capsys):
     monkeypatch.setattr(tables, "collect_data", lambda *_: None)
-    monkeypatch.setattr(tables, "run_all", lambda function, tasks, jobs: [(task, function(*task)) for task in tasks])
     figures = tables.reproduce(["optical-flow"], tmp_path, TINY_SCALE)
     assert "1 of 4: full_clean_long, seed 1: ratio" in capsys.readouterr().out
     assert figures["farneback_optical_epe_px"] > 0
@@ -224,12 +218,12 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
 
 
 def test_the_experiment_asks_for_every_scene_and_every_try(tmp_path, monkeypatch):
-    def run_all(function, tasks, jobs):
+    def map(function, *tasks):
+        tasks = list(zip(*tasks))
         assert len(set(tasks)) == len(tasks) == 6 * 3 * 6 + 2 * 3 * 5
         assert {task[2] for task in tasks if task[1]} == {0, 1, 2, 3, 4, 6}, "not the seed of the training pokes"
-        return {task: tables.outcome(record([0.1, 0.05])) for task in tasks}
-    monkeypatch.setattr(tables, "run_all", run_all)
-    figures, curves = tables.reproduce_planning(tmp_path, "run.npz", scenes=6)
+        return [tables.outcome(record([0.1, 0.05])) for task in tasks]
+    figures, curves = tables.reproduce_planning(tmp_path, "run.npz", 6, map)
     assert curves["oracle", 3].shape == (6, 11) and figures["learned_1_left"] == pytest.approx(0.5)
 
 

@@ -98,9 +98,9 @@ def run_collect(args):
                         textures=tuple(args.textures), place_within=args.within, width=args.size[0],
                         height=args.size[1])
     began, show = time.perf_counter(), progress_line("collect")
-    with parallel_map(args.jobs) as map, only_one(args.out):
+    with parallel_map(args.jobs, args.cluster) as map:
         show(0, args.pokes)
-        counts = collect(args.out, args.pokes, args.seed, settings, map, show)
+        counts = collect(args.out, args.pokes, args.seed, settings, map, show, args.part)
     seconds = time.perf_counter() - began
     dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
     print(f"{args.out}: {counts['kept']} pokes in {seconds:.1f} s; dropped: {dropped}")
@@ -223,20 +223,22 @@ def run_show(args):
 def run_reproduce(args):
     from . import figures
     out = Path(args.out or (f"runs/{args.table}" if args.table in ("planning", "contact")
-                            else "runs/reproduce-quick" if args.quick else "runs/reproduce"))
-    if args.table == "contact":
-        found = contact.reproduce(checkpoints.load_run(args.checkpoint), 100 if args.quick else 1000, args.jobs,
-                                  progress_line("poke"))
-        print(contact.contact_table(found))
-    elif args.table == "planning":
-        found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
-        print(tables.planning_table(found))
-        figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
-    else:
-        names = list(tables.TABLES) if args.table == "all" else [args.table]
-        scale = tables.QUICK if args.quick else tables.FULL
-        found = tables.reproduce(names, out, scale, args.jobs, progress=progress_line("collect"))
-        print(tables.tables_text(names, found))
+                            else "runs/reproduce-quick" if args.quick else "runs/reproduce")).absolute()
+    checkpoint = Path(args.checkpoint).absolute()  # other machines have another working folder
+    with parallel_map(args.jobs, args.cluster) as map:
+        if args.table == "contact":
+            found = contact.reproduce(checkpoints.load_run(checkpoint), 100 if args.quick else 1000, map,
+                                      progress_line("poke"))
+            print(contact.contact_table(found))
+        elif args.table == "planning":
+            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map)
+            print(tables.planning_table(found))
+            figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
+        else:
+            names = list(tables.TABLES) if args.table == "all" else [args.table]
+            scale = tables.QUICK if args.quick else tables.FULL
+            found = tables.reproduce(names, out, scale, map, progress_line("collect"))
+            print(tables.tables_text(names, found))
     write_json(args.json or out / f"{args.table}.json", found)
 
 
@@ -342,6 +344,12 @@ def missing_kind(text):
         return text
 
 
+def part_of(text):
+    """'3/8' -> (3, 8). Raises ValueError for anything else; argparse then says so."""
+    which, parts = map(int, text.split("/"))
+    return which, parts
+
+
 class OneLineParser(argparse.ArgumentParser):
     """argparse without the usage text before an error."""
 
@@ -359,6 +367,7 @@ SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz", "type": che
 TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
+CLUSTER = {"metavar": "ADDRESS", "help": "of a Dask scheduler, whose workers do it instead"}
 JSON = {"metavar": "FILE", "help": "write the figures here too"}
 
 
@@ -389,7 +398,9 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                    "help": "of the pictures, px, 4:3"},
         "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
-        "--jobs": JOBS, "--json": JSON}),
+        "--part": {"type": part_of, "metavar": "I/N", "default": (1, 1),
+                   "help": "the I-th of N that share the work, at once or not; without it, what is missing (default all)"},
+        "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
     "import": (run_import, "make a folder of shards from a real camera's recording: see docs/own-data.md", {
         "folder": {"help": "of the recording: camera.json, pokes.csv and PNG pictures"},
         "out": {"help": "folder to write the shards to"},
@@ -433,7 +444,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
-        "--jobs": JOBS, "--json": JSON}),
+        "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
     "demo": (run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, train, "
              "evaluate and show on the shipped pokes", {
         "--out": {"default": "runs/demo"}, "--seed": SEED, "--jobs": JOBS, "--json": JSON}),
@@ -453,7 +464,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--seed": {"metavar": "FILE", "help": "of the held-back inputs: a number, or a file they never see (drawn)"},
         "--pokes": {"metavar": "FOLDER", "help": "assignment 8: held-back pokes, with their truth (the shipped ones)"},
         "--out": {"default": "results.json", "help": "in Gradescope's format, whole after every task"},
-        "--jobs": {"type": int, "default": 2, "help": "submissions at a time"}}),
+        "--jobs": {"type": int, "default": 2, "help": "submissions at a time"}, "--cluster": CLUSTER}),
 }
 
 

@@ -3,19 +3,17 @@
 Paper: Sec. IV, Tables I to III, and the control experiment of Sec. IV-G. Every cell of a table is a training run with a
 budget of its own, on one core; what is finished leaves its figures in a file and is never run again.
 """
-import json
 import subprocess
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from itertools import product
-from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
 
-from .. import check_whole, planning, training
+from .. import planning, training
 from ..disk import checkpoints
-from ..disk.files import plain, write_json
+from ..disk.files import plain, read_json, write_json
 from ..disk.shards import load_interactions
 from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
@@ -23,7 +21,6 @@ from ..sim.objects import HELD_OUT
 from ..sim.truth import load_truth
 from . import control, evaluation, image_pairs, se3nets
 from .noise import under_noise
-from .processes import parallel_map, worker_pool
 from .runs import train_saving
 
 
@@ -91,7 +88,7 @@ def cells_of_tables(tables, scale):
     cells = []
     for seed in scale.seeds:  # so that one seed of everything is there first
         cells += [Cell("full", noise, seed, long=True) for noise in NOISES]
-        cells += [Cell(model, noise, seed) for table in tables for model in TABLES[table] for noise in NOISES]
+        cells += [Cell(model, noise, seed) for noise in NOISES for table in tables for model in TABLES[table]]
     return list(dict.fromkeys(cells))
 
 
@@ -159,8 +156,8 @@ def once(path, made, compute):
     if not path.exists():
         began_at = commit()
         write_json(path, {**made, "metrics": compute(), "commit": began_at})
-    found = json.loads(path.read_text())
-    if not made_of(found, made):
+    found = read_json(path)
+    if "metrics" not in found or not made_of(found, made):
         raise ValueError(f"{path}: made with another recipe, network, data or search; remove it, or choose another "
                          "--out")
     return found["metrics"]
@@ -207,25 +204,13 @@ def run_cell(cell, out, scale, save_every=60.0):
 
 # --- all of them ------------------------------------------------------------------------------------------------
 
-def run_all(function, tasks, jobs):
-    """(task, function(*task)) of tuples, in order, as they are there; over so many processes."""
-    check_whole("jobs", jobs, 1)
-    with worker_pool(jobs) as pool:
-        try:
-            yield from zip(tasks, pool.map(function, *zip(*tasks)))
-        except BaseException:  # an interrupt must not wait for what runs: its files are on disk
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
-
-
-def reproduce(tables, out, scale, jobs=1, progress=None):
-    """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
-    with parallel_map(jobs) as map:
-        collect_data(out, scale, map, progress)
+def reproduce(tables, out, scale, map=map, progress=None):
+    """Everything that some tables need -> flat dict of figures. map: as of `collect`; cells run side by side with that
+    of an executor, one core each.
+    """
+    collect_data(out, scale, map, progress)
     cells, results = cells_of_tables(tables, scale), {}
-    for (cell,), metrics in run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs):
+    for cell, metrics in zip(cells, map(partial(run_cell, out=out, scale=scale), cells)):
         results[cell] = metrics
         print(f"{len(results)} of {len(cells)}: {cell.group}, seed {cell.seed}: ratio {metrics['flow_mse_ratio']:.3f}, "
               f"{metrics['train_seconds'] / 60:.1f} min", flush=True)
@@ -340,7 +325,7 @@ def outcome(record):
             "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist(), "stopped": record["stopped"]}
 
 
-def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
+def reproduce_planning(out, checkpoint, scenes=20, map=map):
     """The paper's control experiment -> flat dict of figures, curves {(planner, objects): (scenes, pokes + 1) m}.
 
     Scenes that were run before, with the same checkpoint and planners, are not run again.
@@ -348,7 +333,7 @@ def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
     seeds = [seed for seed in range(scenes + 1) if seed != TRAIN_SEED][:scenes]
     todo = list(product(PLANNERS, OBJECTS, seeds, [0]))
     todo += product(("learned", "greedy"), [0], range(OBSTACLE_SCENES), range(OBSTACLE_TRIES))
-    return summarise_planning(dict(run_all(partial(run_scene, checkpoint, out), todo, jobs)))
+    return summarise_planning(dict(zip(todo, map(partial(run_scene, checkpoint, out), *zip(*todo)))))
 
 
 def summarise_planning(results):
