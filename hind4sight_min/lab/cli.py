@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.shards import load_interactions
 from ..networks import Sizes
 from ..sim.arena import Settings
+from ..sim.bodies import read_urdfs
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import find_truth
@@ -91,10 +93,17 @@ def print_metrics(metrics):
 
 # --- commands ----------------------------------------------------------------------------------------------
 
+def drawn_from(args):
+    """The fields of Settings that say what lies in the arena: of --urdf and --scale, and of --kinds where there are."""
+    if args.scale != 1 and not args.urdf:
+        raise ValueError("--scale: expected --urdf with it, whose objects it scales")
+    kinds = getattr(args, "kinds", None) or (() if args.urdf else Settings.kinds)
+    return {"kinds": tuple(kinds), "own": read_urdfs(args.urdf, args.scale) if args.urdf else ()}
+
+
 def run_collect(args):
-    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
-                        textures=tuple(args.textures), place_within=args.within, width=args.size[0],
-                        height=args.size[1])
+    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], textures=tuple(args.textures),
+                        place_within=args.within, width=args.size[0], height=args.size[1], **drawn_from(args))
     began, show = time.perf_counter(), progress_line("collect")
     with parallel_map(args.jobs) as map, only_one(args.out):
         show(0, args.pokes)
@@ -220,7 +229,8 @@ def run_plan(args):
     if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search, path = planning.Search(**options), Path(args.out) / "plan.gif"
-    with control.random_task(args.seed, args.objects, args.obstacle, control.settings_for(run)) as task:
+    settings = replace(control.settings_for(run), **drawn_from(args)) if args.urdf else control.settings_for(run)
+    with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
         record = control.closed_loop(task, run, args.policy, search, args.budget, args.seed)
@@ -310,6 +320,8 @@ TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
 JSON = {"metavar": "FILE", "help": "write the figures here too"}
+OWN = {"--urdf": {"nargs": "+", "metavar": "FILE", "help": "objects of your own: anything rigid that Bullet loads"},
+       "--scale": {"type": float, "default": 1.0, "help": "how many times as large as the URDF files say"}}
 
 
 def fields(record, *names, **how):
@@ -328,7 +340,9 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                      "help": "part of the arena that they are put down in, at most 1"},
         "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
                    "help": "of the pictures, px, 4:3"},
-        "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
+        "--kinds": {"nargs": "+", "help": f"of {', '.join(KINDS)}; with --urdf too, half of the objects (default "
+                    f"{' '.join(Settings.kinds)}, with --urdf none)"},
+        **OWN,
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--jobs": JOBS, "--json": JSON}),
     "train": (run_train, "train the full model (Eq. 6) on a folder of shards, without labels", {
@@ -351,6 +365,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
         "--objects": {"type": int, "default": 1, "choices": (1, 2, 3), "help": "how many are to be moved"},
         "--obstacle": {"action": "store_true", "help": "a scene with another object in the way"},
+        **OWN,
         "--mark": {**PIXEL, "help": "a pixel on an object, again for each; --goal as often, in place of the scene's"},
         "--goal": {**PIXEL, "help": "where that shall go"},
         "--policy": {"choices": control.POLICIES, "default": "learned"},

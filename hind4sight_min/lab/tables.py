@@ -295,7 +295,7 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
-        "settings": asdict(control.settings_for(run))}), compute)
+        "settings": control.settings_for(run).plain}), compute)
 
 
 def outcome(record):

@@ -1,6 +1,5 @@
 """Collection: shards of pokes, each in a Bullet world with its own seed. Paper: Sec. IV-A and IV-B."""
 from collections import Counter
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -45,7 +44,7 @@ def collect_shard(settings, seed, index, pokes, world=None):
     befores, afters, drawn, starts = zip(*kept)
     rgb_before, depth_before, labels, poses_before = map(np.stack, zip(*befores))
     rgb_after, depth_after, _, poses_after = map(np.stack, zip(*afters))
-    meta = plain({"seed": seed, "shard": index, "settings": asdict(settings), "counts": dict(counts)})
+    meta = plain({"seed": seed, "shard": index, "settings": settings.plain, "counts": dict(counts)})
     interactions = Interactions(rgb_before, rgb_after, depth_before, depth_after, np.stack(drawn), np.stack(starts),
                                 arena.empty_depth, arena.camera, meta)
     return interactions, Truth(labels, poses_before, poses_after)
@@ -85,7 +84,7 @@ def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None):
         jobs[path] = index, path, min(SHARD_POKES, pokes - first)
     for path in find_shards(folder):
         old, (_, _, size) = load_shard(path), jobs.get(path, (None, None, 0))
-        if (old.meta["seed"], old.settings, len(old)) != (seed, plain(asdict(settings)), size):
+        if (old.meta["seed"], old.settings, len(old)) != (seed, settings.plain, size):
             raise ValueError(f"{path}: holds data of another seed, other settings or another number of pokes")
         if truth_path(path).exists():
             counts.update(old.meta["counts"])
