@@ -51,7 +51,7 @@ def test_a_task_is_the_same_every_time_and_its_goal_can_be_met():
     for _ in range(2):
         with control.random_task(3, 2) as task:
             seen.append((task.arena.observe()[0], task.arena.poses(), task.goal_poses, task.goal[0], task.goal_marks))
-            task.arena.kinds[:] = ["carton"] * len(task.arena.kinds)  # a kind whose turn can be seen
+            task.arena.round[:] = [False] * len(task.arena.round)  # turns that can be seen
             angles = control.distances(task.arena.poses(), task)[1]
     for first, second in zip(*seen):
         np.testing.assert_array_equal(first, second)
@@ -90,16 +90,16 @@ def test_an_obstacle_stands_across_half_of_the_way_and_is_marked_to_stay():
 
 
 def test_distances_against_a_turn_by_hand(task):
-    mover, kinds = task.movers[0], list(task.arena.kinds)
-    task.arena.kinds[mover] = "carton"
+    mover, were = task.movers[0], list(task.arena.round)
+    task.arena.round[mover] = False
     poses = task.goal_poses.copy()
     poses[mover, :2] += [0.03, -0.04]
     poses[mover, 3:] = (Rotation.from_euler("z", 0.3) * Rotation.from_quat(poses[mover, 3:])).as_quat()
     distance, angle = control.distances(poses, task)
     np.testing.assert_allclose([distance[0], angle[0]], [0.05, 0.3], atol=1e-5)
-    task.arena.kinds[mover] = "can"
-    assert np.isnan(control.distances(poses, task)[1]).all()  # a can looks the same from all sides
-    task.arena.kinds[:] = kinds
+    task.arena.round[mover] = True
+    assert np.isnan(control.distances(poses, task)[1]).all()  # it looks the same from all sides
+    task.arena.round[:] = were
 
 
 def test_marks_and_goals_of_the_users_own(task):

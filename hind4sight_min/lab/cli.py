@@ -4,6 +4,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +18,7 @@ from ..disk.recordings import save_recording
 from ..disk.shards import each_shard, load_interactions
 from ..networks import Sizes
 from ..sim.arena import MIDDLE, Settings
+from ..sim.bodies import read_urdfs
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.truth import find_truth
@@ -93,10 +95,17 @@ def print_metrics(metrics):
 
 # --- commands ----------------------------------------------------------------------------------------------
 
+def drawn_from(args):
+    """The fields of Settings that say what lies in the arena: of --urdf and --scale, and of --kinds where there are."""
+    if args.scale != 1 and not args.urdf:
+        raise ValueError("--scale: expected --urdf with it, whose objects it scales")
+    kinds = getattr(args, "kinds", None) or (() if args.urdf else Settings.kinds)
+    return {"kinds": tuple(kinds), "own": read_urdfs(args.urdf, args.scale) if args.urdf else ()}
+
+
 def run_collect(args):
-    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
-                        textures=tuple(args.textures), place_within=args.within, width=args.size[0],
-                        height=args.size[1])
+    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], textures=tuple(args.textures),
+                        place_within=args.within, width=args.size[0], height=args.size[1], **drawn_from(args))
     began, show = time.perf_counter(), progress_line("collect")
     with parallel_map(args.jobs, args.cluster) as map:
         show(0, args.pokes)
@@ -253,7 +262,8 @@ def run_plan(args):
     if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search, path = planning.Search(**options), Path(args.out) / "plan.gif"
-    with control.random_task(args.seed, args.objects, args.obstacle, control.settings_for(run)) as task:
+    settings = replace(control.settings_for(run), **drawn_from(args)) if args.urdf else control.settings_for(run)
+    with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
         record = control.closed_loop(task, run, args.policy, search, args.budget, args.seed)
@@ -369,6 +379,8 @@ SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action":
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
 CLUSTER = {"metavar": "ADDRESS", "help": "of a Dask scheduler, whose workers do it instead"}
 JSON = {"metavar": "FILE", "help": "write the figures here too"}
+OWN = {"--urdf": {"nargs": "+", "metavar": "FILE", "help": "objects of your own: anything rigid that Bullet loads"},
+       "--scale": {"type": float, "default": 1.0, "help": "how many times as large as the URDF files say"}}
 
 
 def fields(record, *names, **how):
@@ -396,7 +408,9 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                      "help": "part of the arena that they are put down in, at most 1"},
         "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
                    "help": "of the pictures, px, 4:3"},
-        "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
+        "--kinds": {"nargs": "+", "help": f"of {', '.join(KINDS)}; with --urdf too, half of the objects (default "
+                    f"{' '.join(Settings.kinds)}, with --urdf none)"},
+        **OWN,
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--part": {"type": part_of, "metavar": "I/N", "default": (1, 1),
                    "help": "the I-th of N that share the work, at once or not; without it, what is missing (default all)"},
@@ -430,6 +444,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
         "--objects": {"type": int, "default": 1, "choices": (1, 2, 3), "help": "how many are to be moved"},
         "--obstacle": {"action": "store_true", "help": "a scene with another object in the way"},
+        **OWN,
         "--mark": {**PIXEL, "help": "a pixel on an object, again for each; --goal as often, in place of the scene's"},
         "--goal": {**PIXEL, "help": "where that shall go"},
         "--policy": {"choices": control.POLICIES, "default": "learned"},

@@ -6,7 +6,7 @@ down, Bullet is asked whether its way is free (`carry_out`). The first start of 
 is nowhere free, the poke is spent.
 """
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -60,7 +60,7 @@ class Task:
     @property
     def settings(self):
         """The arena's Settings as a dict."""
-        return asdict(self.arena.settings)
+        return vars(self.arena.settings)
 
 
 @contextmanager
@@ -249,7 +249,7 @@ def distances(poses, task):
     here, there = poses[task.movers], task.goal_poses[task.movers]
     turn = (Rotation.from_quat(here[:, 3:]) * Rotation.from_quat(there[:, 3:]).inv()).as_matrix()
     angle = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
-    angle[[task.arena.kinds[i] == "can" for i in task.movers]] = np.nan
+    angle[[task.arena.round[i] for i in task.movers]] = np.nan
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 

@@ -170,8 +170,8 @@ def made_of(found, made):
 
 def ingredients(cell, scale):
     """All that decides the figures of a cell, in plain JSON types, as `once` keeps it."""
-    data = {"train": (TRAIN_SEED, asdict(Settings()), scale.train_pokes),
-            **{name: (seed, asdict(settings), times * scale.test_pokes)
+    data = {"train": (TRAIN_SEED, Settings().plain, scale.train_pokes),
+            **{name: (seed, settings.plain, times * scale.test_pokes)
                for name, (seed, settings, times) in TESTS.items()}}
     return plain({"recipe": asdict(recipe_of(cell, scale)), "window": MODELS[cell.model][2],
                   "depth_noise": NOISES[cell.noise], "format": checkpoints.FORMAT, "data": data})
@@ -310,7 +310,7 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
-        "settings": asdict(control.settings_for(run))}), compute)
+        "settings": control.settings_for(run).plain}), compute)
 
 
 def outcome(record):
