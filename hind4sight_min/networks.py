@@ -181,8 +181,8 @@ def forward_model(params, sizes, points, valid, pokes, arena=np.inf):
     """
     local = poke_frame(points, pokes)
     met = first_met(local, valid)[:, None]
-    heights = height_map(local, valid) + wall_map(pokes, arena).astype(points.dtype)
-    shape = layer(params, "shape_2", layer(params, "shape_1", heights))  # (B, C)
+    shape = layer(params, "shape_1", height_map(local, valid) + wall_map(pokes, arena))
+    shape = layer(params, "shape_2", shape)  # (B, C)
 
     def context(h):  # (B, M, C) -> (B, 3 C)
         return anp.concatenate([max_over_points(h, valid), anp.matmul(met, h)[:, 0], shape], axis=1)
