@@ -53,6 +53,19 @@ def test_all_eighty_planted_faults_still_fit_the_source():
         assert all((ROOT / "tests" / f"test_{name}.py").exists() for name in fault.tests.split()), fault.name
 
 
+def test_minutes_to_a_ratio_ends_with_the_first_run_that_reaches_it(tmp_path):
+    for name, count in (("train", 9), ("test", 4)):
+        save_shard(tmp_path / name / "shard_0000.npz", load_interactions(ROOT / "data_small" / "test")[:count])
+        save_truth(tmp_path / name / "shard_0000.npz", load_truth(ROOT / "data_small" / "test")[:count])
+    command = [sys.executable, ROOT / "benchmarks" / "minutes_to.py", tmp_path / "train", tmp_path / "test"]
+    for ratio, asked in ((99, [1]), (0, [1, 2])):
+        subprocess.run([*command, "--ratio", str(ratio), "--steps", "2", "1", "--json", tmp_path / "found.json"], check=True,
+                       capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        found = json.loads((tmp_path / "found.json").read_text())
+        assert [steps for steps in (1, 2) if f"steps_{steps}_ratio" in found] == asked
+        assert ("minutes" in found) == (ratio > 0)
+
+
 def test_the_table_of_camera_faults_runs(tmp_path):
     test = ROOT / "data_small" / "test"
     save_shard(tmp_path / "shard_0000.npz", load_interactions(test)[:6])

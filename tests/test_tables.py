@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_rel
 from test_se3nets import moved_blocks
 from tiny import TINY, camera, tiny_pokes
 
@@ -148,6 +149,17 @@ def test_summary_is_mean_and_sd_over_the_seeds(figures):
     assert figures["full_clean_long_flow_mse_ratio"] == pytest.approx(2 * 0.65)
     assert figures["full_noisy_flow_mse_ratio"] == pytest.approx(2 * 1.55)
     assert figures["seeds"] == TINY_SCALE.seeds and figures["steps"] == TINY_SCALE.steps
+
+
+def test_the_order_of_the_ablation_is_told_by_differences_within_a_seed():
+    ratios = {"2d": (0.30, 0.34, 0.35), "2d_3d": (0.20, 0.23, 0.22), "full": (0.19, 0.23, 0.24), "3d": (0.4, 0.5, 0.6)}
+    found = tables.summarise({Cell(model, noise, seed): {"flow_mse_ratio": value} for model, values in ratios.items()
+                              for noise in tables.NOISES for seed, value in enumerate(values)}, TINY_SCALE)
+    assert found["2d_less_2d_3d_clean"] == pytest.approx((0.10 + 0.11 + 0.13) / 3)
+    interval = ttest_rel(ratios["2d"], ratios["2d_3d"]).confidence_interval(0.95)
+    assert found["2d_less_2d_3d_noisy_ci95"] == pytest.approx((interval.high - interval.low) / 2), "not paired by seed?"
+    row = next(line for line in tables.order_table(found).splitlines() if line.startswith("| 2D loss + 3D loss less full"))
+    assert row == f"| 2D loss + 3D loss less full model | clean | 0.004 | 0.040, 0.039 | -0.003 \u00b1 {0.0379:.3f} |"
 
 
 def test_the_papers_claims_by_hand(figures):

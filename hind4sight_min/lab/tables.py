@@ -10,6 +10,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy.special import stdtrit
 
 from .. import planning, training
 from ..disk import checkpoints
@@ -58,6 +59,9 @@ MODELS = {
     "full": ("full model", training.WEIGHTS, None, (1.47, 1.63)),
 }
 NO_MOTION_PAPER = 12.6  # Table II, cm^2
+# What the ablation orders, the larger error first, and the SD that Table I gives of each, without and with noise.
+ORDER = (("2d_3d", "full"), ("2d", "2d_3d"), ("3d", "2d_3d"))
+SD_PAPER = {"2d": (0.46, 0.48), "3d": (0.49, 24.08), "2d_3d": (0.50, 0.64), "full": (0.49, 0.47)}
 OPTICAL_PAPER, PEER_PAPER = "0.05", "0.11"  # Table III, px; the peer is FlowNet 2.0
 
 TABLES = {"flow": [name for name in MODELS if name.startswith("se3nets")] + ["full"],
@@ -221,7 +225,11 @@ def reproduce(tables, out, scale, map=map, progress=None):
 
 
 def summarise(results, scale):
-    """{Cell: metrics} -> mean and SD over the seeds of every metric, and the scale: a flat dict."""
+    """{Cell: metrics} -> mean and SD over the seeds of every metric, and the scale: a flat dict.
+
+    worse_less_better_noise of ORDER: by how much the ratios of the same seed differ, the mean; _ci95: half of its 95 %
+    interval, by Student's t.
+    """
     figures, groups = asdict(scale), {}
     for cell, metrics in results.items():
         groups.setdefault(cell.group, []).append(metrics)
@@ -230,6 +238,12 @@ def summarise(results, scale):
             values = [metrics[metric] for metrics in seeds]
             figures[f"{group}_{metric}"] = float(np.mean(values))
             figures[f"{group}_{metric}_sd"] = float(np.std(values, ddof=1))
+    for (worse, better), noise in product(ORDER, NOISES):
+        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])] for model in (worse, better)]
+        if all(ours):
+            less, name = np.subtract(*ours), f"{worse}_less_{better}_{noise}"
+            figures[name] = float(less.mean())
+            figures[f"{name}_ci95"] = float(stdtrit(len(less) - 1, 0.975) * less.std(ddof=1) / np.sqrt(len(less)))
     return figures
 
 
@@ -260,6 +274,18 @@ def flow_table(figures, name):
     return table(*rows)
 
 
+def order_table(figures):
+    """How sure the order of the ablation is: differences within a seed, ours with their interval, and the paper's."""
+    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval over seeds")]
+    for (worse, better), (i, noise) in product(ORDER, enumerate(NOISES)):
+        name, paper = f"{worse}_less_{better}_{noise}", MODELS[worse][3][i] - MODELS[better][3][i]
+        if name in figures:
+            rows.append((f"{MODELS[worse][0]} less {MODELS[better][0]}", noise, f"{paper / NO_MOTION_PAPER:.3f}",
+                         ", ".join(f"{SD_PAPER[model][i] / NO_MOTION_PAPER:.3f}" for model in (worse, better)),
+                         f"{figures[name]:.3f} \u00b1 {figures[name + '_ci95']:.3f}"))
+    return table(*rows)
+
+
 def optical_table(figures):
     """Table III of the paper, ours beside it."""
     rows = [("optical flow, end-point error", "sees", "paper", "moving pixels, px", "all pixels, px")]
@@ -274,8 +300,8 @@ def optical_table(figures):
 
 def tables_text(tables, figures):
     """The asked-for tables as Markdown."""
-    return "\n\n".join(optical_table(figures) if name == "optical-flow" else flow_table(figures, name)
-                       for name in tables)
+    made = {"optical-flow": [optical_table], "ablation": [partial(flow_table, name="ablation"), order_table]}
+    return "\n\n".join(make(figures) for name in tables for make in made.get(name, [partial(flow_table, name=name)]))
 
 
 # --- planning (Sec. IV-G) -----------------------------------------------------------------------------------------
