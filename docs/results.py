@@ -149,6 +149,8 @@ HEADLINES = {
                          "< 300"),
     "student_loop_seconds": ("grade_class", "student_loop_seconds", "course: seconds from saving to the verdict",
                              "{:.1f}", "< 3"),
+    "roundtrip_mm": ("roundtrip", "roundtrip_mm", "real cameras: error of points after export and import, mm", "{:.2f}",
+                     "<= 1"),
     "core_lines": ("house", "core_lines", "lines of the core", "{:.0f}", "<= 1700"),
     "package_lines": ("house", "package_lines", "lines of the package, the course apart", "{:.0f}",
                       "<= 4000"),

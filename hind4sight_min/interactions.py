@@ -57,7 +57,8 @@ class Interactions:
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
             if "depth" in name and not (value.min(initial=0) >= 0 and value.max(initial=0) <= MOST_DEPTH):
-                raise ValueError(f"{name}: expected 0 (missing) to {MOST_DEPTH} m, got {value.min():g} to {value.max():g}")
+                raise ValueError(f"{name}: expected 0 (missing) to {MOST_DEPTH} m, got {value.min():g} to "
+                                 f"{value.max():g}")
             if name in ("depth_before", "depth_after") and not (value.max(axis=(1, 2)) > 0).all():
                 raise ValueError(f"{name}: expected depth in every picture, got none in row "
                                  f"{value.max(axis=(1, 2)).argmin()}")

@@ -77,10 +77,11 @@ class Recording:
             raise ValueError("origin: expected none beside arena_from_camera, which says where it is")
         for name, poke, start in zip(self.names, self.pokes, self.starts):
             if not np.abs([*poke[:2], *start]).max() <= side:
-                raise ValueError(f"poke {name}: expected a start and a target in the arena, in m, got {start} and {poke[:2]}")
-            dx, dy = poke[:2] - start
-            if not np.cos(poke[2] - np.arctan2(dy, dx)) > 0.98 or abs(poke[2]) > 7:  # 7: degrees can look right
-                raise ValueError(f"poke {name}: expected its direction from start to target, {np.arctan2(dy, dx):.3f} rad, "
+                raise ValueError(f"poke {name}: expected start and target within {side:g} m of the middle, got "
+                                 f"{start} and {poke[:2]}")
+            ahead = np.arctan2(*(poke[:2] - start)[::-1])
+            if not np.cos(poke[2] - ahead) > 0.98 or abs(poke[2]) > 7:  # degrees may agree by chance
+                raise ValueError(f"poke {name}: expected its direction, from start to target, to be {ahead:.3f} rad, "
                                  f"got {poke[2]:g}")
 
     def picture(self, name):
@@ -121,18 +122,18 @@ def _rows(text):
     reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
     if sorted(reader.fieldnames or ()) != sorted(COLUMNS):
         raise ValueError(f"expected columns {', '.join(COLUMNS)}, got {', '.join(reader.fieldnames or ['none'])}")
-    names, values = [], []
+    found = {}
     for row in reader:
+        name = row["name"]
+        if not name or Path(name).name != name or name in found:
+            raise ValueError(f"line {reader.line_num}: expected a name of its own, of files here, got {name!r}")
         try:
-            names.append(row.pop("name"))
-            values.append([float(row[column]) for column in COLUMNS[1:]])
+            found[name] = [float(row[column]) for column in COLUMNS[1:]]
         except (TypeError, ValueError):
             raise ValueError(f"line {reader.line_num}: expected a name and five numbers") from None
-        if Path(names[-1]).name != names[-1] or names[-1] in names[:-1]:
-            raise ValueError(f"line {reader.line_num}: expected a name of its own, of files in this folder, got {names[-1]!r}")
-    if not names:
+    if not found:
         raise ValueError("expected a poke at least")
-    return names, np.array(values, np.float32)
+    return list(found), np.array(list(found.values()), np.float32)
 
 
 def load_recording(folder):
@@ -141,7 +142,7 @@ def load_recording(folder):
     try:
         entries, known = dict(json.loads(_text(path))), [each.name for each in fields(Recording)][4:]
         if set(entries) - set(known):
-            raise ValueError(f"expected no other entries than {', '.join(known)}, got {', '.join({*entries} - {*known})}")
+            raise ValueError(f"expected no other entries than {', '.join(known)}, got {', '.join(entries)}")
         path = Path(folder) / POKES
         names, values = _rows(_text(path))
         path = Path(folder)

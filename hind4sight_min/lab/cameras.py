@@ -14,8 +14,7 @@ from ..disk.recordings import EMPTY, load_recording
 from ..disk.shards import find_shards, save_shard
 from ..geometry import Camera, project, unproject
 from ..interactions import MOST_DEPTH, Interactions
-from ..scene import look
-from ..training import scenes_of
+from ..scene import look, scene_of
 
 COARSEST = 2.0  # times the pixels that a model was trained with
 
@@ -34,8 +33,8 @@ def check_camera(camera, trained=None):
                          f"({x:.0f}, {y:.0f}) of {camera.width} x {camera.height} px, {ahead:.3g} m ahead")
     limit = COARSEST * trained.pixel_size if trained else np.inf
     if camera.pixel_size > limit:
-        raise ValueError(f"camera: fx: expected pixels of at most {1e3 * limit:.0f} mm on the table, {COARSEST:g} times "
-                         f"those of the training, got {1e3 * camera.pixel_size:.0f} mm")
+        raise ValueError(f"camera: fx: expected pixels of at most {1e3 * limit:.0f} mm on the table, "
+                         f"{COARSEST:g} times those of the training, got {1e3 * camera.pixel_size:.0f} mm")
 
 
 # --- smaller pictures without distortion --------------------------------------------------------------------------
@@ -56,8 +55,8 @@ class Sampling:
 
     def colour(self, picture):
         """(h, w, 3) uint8 -> (H, W, 3): the mean of every block."""
-        height, width = np.array(self.maps[0].shape) // self.block
-        return cv2.resize(cv2.remap(picture, *self.maps, cv2.INTER_LINEAR), (width, height), interpolation=cv2.INTER_AREA)
+        fine, (height, width) = cv2.remap(picture, *self.maps, cv2.INTER_LINEAR), self.maps[0].shape
+        return cv2.resize(fine, (width // self.block, height // self.block), interpolation=cv2.INTER_AREA)
 
     def depth(self, picture):
         """(h, w) m, 0 = missing -> (H, W): the median of every block, of two middle ones the nearer. A mean would lie
@@ -77,9 +76,9 @@ def sampling_of(recording, size):
     as has that form. Raises ValueError for a size larger than theirs.
     """
     size, recorded, matrix = np.array(size), np.array([recording.width, recording.height]), recording.camera_matrix
-    factor = (recorded / size).min() if size.min() > 0 else 0
-    if size.min() < 16 or factor < 1:
-        raise ValueError(f"size: expected 16 x 16 px to {recorded[0]} x {recorded[1]} as recorded, got {size[0]} x {size[1]}")
+    if size.min() < 16 or (size > recorded).any():
+        raise ValueError("size: expected 16 x 16 px to {} x {} as recorded, got {} x {}".format(*recorded, *size))
+    factor = (recorded / size).min()
     block, corner = int(np.ceil(factor)), (recorded - factor * size) / 2
 
     def scaled(factor):  # a pixel's middle has whole coordinates, so a picture begins at -1/2
@@ -102,8 +101,8 @@ def metres_of(name, counts, unit):
     depth = counts.astype(np.float32) * np.float32(unit)
     middle = float(np.median(depth[counts > 0])) if counts.any() else 0.0
     if not LEAST_DEPTH <= middle <= MOST_DEPTH:
-        raise ValueError(f"{name}: expected depths of {LEAST_DEPTH} to {MOST_DEPTH} m, got a median of {middle:.4g} m with a "
-                         f"depth_unit of {unit:g} m")
+        raise ValueError(f"{name}: expected depths of {LEAST_DEPTH} to {MOST_DEPTH} m, got a median of {middle:.4g} m "
+                         f"with a depth_unit of {unit:g} m")
     return np.where(depth <= MOST_DEPTH, depth, np.float32(0))
 
 
@@ -121,8 +120,8 @@ def rigid_pose(matrix):
     rotation = matrix[:3, :3]
     if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
             and np.array_equal(matrix[3], [0, 0, 0, 1])):
-        raise ValueError("arena_from_camera: expected a rotation, orthonormal to 0.001, and a translation above 0 0 0 1, "
-                         f"got {matrix.tolist()}")
+        raise ValueError("arena_from_camera: expected a rotation, orthonormal to 0.001, and a translation, above "
+                         f"0 0 0 1, got {matrix.tolist()}")
     pose = matrix.copy()
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-9):
         pose[:3, :3] = Rotation.from_matrix(rotation).as_matrix()
@@ -159,8 +158,8 @@ def table_pose(empty_depth, matrix, ray):
                                       np.random.default_rng(0))
     normal = -np.sign(normal @ middle) * normal  # towards the camera
     if share < LEAST_TABLE or normal @ ray > -0.1 * np.linalg.norm(ray):
-        raise ValueError(f"{EMPTY}: expected a table under the origin, got {share:.0%} of the points in the plane of normal "
-                         f"{normal.round(2).tolist()}; give arena_from_camera")
+        raise ValueError(f"{EMPTY}.png: expected a table under the origin, got {share:.0%} of the points in a plane of "
+                         f"normal {normal.round(2).tolist()}, camera axes; give arena_from_camera")
     right = np.array([1.0, 0, 0]) - normal[0] * normal
     right /= np.linalg.norm(right)
     pose = np.eye(4)
@@ -190,18 +189,35 @@ def filled(empty_depth, camera):
 SHARD_POKES = 100
 
 
+def camera_of(recording, sampling, empty_depth):
+    """The Camera of the smaller pictures, with the pose as recorded or as the small empty picture (H, W) m shows it,
+    and the share of that picture's points in the table, NaN where nobody looked.
+
+    Raises ValueError as `table_pose`, `rigid_pose` and `check_camera` do.
+    """
+    pose, share, pixel = recording.arena_from_camera, np.nan, recording.origin
+    if pose is None:
+        pixel = np.array([recording.width - 1, recording.height - 1]) / 2 if pixel is None else pixel
+        ray = cv2.undistortPoints(pixel.reshape(1, 1, 2), recording.camera_matrix, recording.distortion)
+        pose, share = table_pose(empty_depth, sampling.matrix, np.append(ray, 1))
+    (fx, _, cx), (_, fy, cy), _ = sampling.matrix
+    camera = Camera(*empty_depth.shape[::-1], fx, fy, cx, cy, rigid_pose(pose))
+    check_camera(camera)
+    return camera, share
+
+
 def import_recording(folder, out, size=(64, 48), progress=None):
     """Make a data set in `out` of the recording in `folder`, with pictures of `size` (W, H) px.
 
     -> a dict of what was found: pokes; camera; table, the share of the empty picture in it, if the pose is from there;
-    missing, the share of the pictures without depth; met, that of the pokes that end where something stands.
-    progress(done, total) is called after every shard. Raises ValueError naming the file or the field that is wrong, also
-    where nothing stands at any poke; then nothing new is left in `out`.
+    missing, the share of pixels without depth; met, that of the pokes that end where something stands.
+    progress(done, total) is called after every shard. Raises ValueError naming the file or the field that is wrong,
+    also where nothing stands at any poke; then nothing new is left in `out`.
     """
-    recording, written, share = load_recording(folder), [], np.nan
+    recording, written, missing, met = load_recording(folder), [], [], []
     if find_shards(out):
         raise ValueError(f"{out}: expected a folder without pokes, got {find_shards(out)[0].name} in it")
-    matrix, distortion, sampling = recording.camera_matrix, recording.distortion, sampling_of(recording, size)
+    names, sampling = recording.names, sampling_of(recording, size)
 
     def colour_of(name):
         return sampling.colour(recording.picture(name))
@@ -210,34 +226,28 @@ def import_recording(folder, out, size=(64, 48), progress=None):
         path = recording.folder / f"{name}.png"
         depth = sampling.depth(metres_of(path, recording.picture(name), recording.depth_unit))
         if not depth.any():
-            raise ValueError(f"{path}: expected depth in {SEEN:.0%} of a pixel of {size[0]} x {size[1]} at least, got none")
+            raise ValueError(f"{path}: expected depth in {SEEN:.0%} of some small pixel, got none")
         return depth
-    empty, pose = depth_of(EMPTY), recording.arena_from_camera
-    if pose is None:
-        middle = np.array([recording.width - 1, recording.height - 1]) / 2
-        pixel = middle if recording.origin is None else recording.origin
-        ray = np.append(cv2.undistortPoints(pixel.reshape(1, 1, 2), matrix, distortion).ravel(), 1)
-        pose, share = table_pose(empty, sampling.matrix, ray)
-    (fx, _, cx), (_, fy, cy), _ = sampling.matrix
-    camera = Camera(*size, fx, fy, cx, cy, rigid_pose(pose))
-    check_camera(camera)
-    empty, names, missing, met = filled(empty, camera), recording.names, [], []
+    empty_depth = depth_of(EMPTY)
+    camera, share = camera_of(recording, sampling, empty_depth)
+    empty_depth, meta = filled(empty_depth, camera), {"settings": recording.settings, "seed": recording.seed}
     try:
         for first in range(0, len(names), SHARD_POKES):
             rows = slice(first, first + SHARD_POKES)
             pictures = [np.stack([read(name + what) for name in names[rows]]) for read, what in (
                 (colour_of, "_before"), (colour_of, "_after"), (depth_of, "_before_depth"), (depth_of, "_after_depth"))]
-            part = Interactions(*pictures, recording.pokes[rows], recording.starts[rows], empty, camera,
-                                {"settings": recording.settings, "seed": recording.seed})
+            part = Interactions(*pictures, recording.pokes[rows], recording.starts[rows], empty_depth, camera, meta)
             written.append(Path(out) / f"shard_{first // SHARD_POKES:04d}.npz")
             save_shard(written[-1], part)
-            missing += [np.mean(part.depth_before == 0), np.mean(part.depth_after == 0)]
-            met += look(scenes_of(part)[0], part.pokes)[1].any(axis=1).tolist()
+            missing += [np.mean(depth == 0) for depth in pictures[2:]]
+            for before, poke in zip(part.depth_before, part.pokes):
+                scene = scene_of(before[None], part.rgb_before[:1], empty_depth, camera, recording.settings["arena"])
+                met.append(bool(look(scene, poke[None])[1].any()))
             if progress:
                 progress(len(met), len(names))
         if not any(met):
-            raise ValueError(f"{folder}: expected pokes that end where something stands, got none; is arena_from_camera "
-                             "this camera's, and are the pokes in arena coordinates?")
+            raise ValueError(f"{folder}: expected pokes that end where something stands, got none; is "
+                             "arena_from_camera this camera's, and are the pokes in arena coordinates?")
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)

@@ -120,12 +120,14 @@ def run_import(args):
     with only_one(args.out):
         found = cameras.import_recording(args.folder, args.out, tuple(args.size), progress_line("import"))
     camera = found.pop("camera")
-    pose, origin = camera.arena_from_camera, "as given" if np.isnan(found["table"]) else \
-        f"from the empty picture, of which {found['table']:.0%} is table"
+    pose, table = camera.arena_from_camera, found["table"]
+    down = np.degrees(np.arcsin(-pose[2, 2]))
+    known = "told" if np.isnan(table) else f"its empty picture shows, {table:.0%} of it table"
     print(f"{args.out}: {found['pokes']} pokes, {camera.width} x {camera.height} px\n"
-          f"  the camera's pose, {origin}: {pose[2, 3]:.3f} m above the table, looking down at "
-          f"{np.degrees(np.arcsin(-pose[2, 2])):.1f} degrees; a pixel is {1e3 * camera.pixel_size:.1f} mm wide there\n"
-          f"  {found['missing']:.0%} of the pixels have no depth; {found['met']:.0%} of the pokes end where something stands")
+          f"  the camera, as {known}: {pose[2, 3]:.3f} m above the table, looking down at {down:.1f} degrees; a pixel "
+          f"is {1e3 * camera.pixel_size:.1f} mm wide there\n"
+          f"  {found['missing']:.0%} of the pixels have no depth; {found['met']:.0%} of the pokes end where something "
+          "stands")
     write_json(args.json, {f"import_{name}": value for name, value in found.items() if np.isfinite(value)})
 
 
