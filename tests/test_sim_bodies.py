@@ -24,10 +24,10 @@ FAST = dict(kinds=(), width=32, height=24)
 ALONE = dict(kinds=(), objects_min=1, objects_max=1)
 
 
-def link(name, geometry, mass=0.3, inertia="0 0 0", place="0 0 0", turn="0 0 0"):
+def link(name, geometry, mass=0.3, inertia="0 0 0", place="0 0 0", turn="0 0 0", solid=True):
     shapes = [f'<{kind}><origin xyz="{place}" rpy="{turn}"/><geometry>{geometry}</geometry>{colour}</{kind}>' for
               kind, colour in (("visual", '<material name="m"><color rgba="0.9 0.1 0.1 1"/></material>'),
-                               ("collision", ""))]
+                               ("collision", ""))[:1 + solid]]
     return (f'<link name="{name}"><contact><lateral_friction value="0.7"/></contact><inertial>'
             f'<origin xyz="{inertia}"/><mass value="{mass}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
             f'</inertial>{"".join(shapes)}</link>')
@@ -38,9 +38,9 @@ def jointed(kind):
             f'type="{kind}"><parent link="a"/><child link="b"/><origin xyz="0.03 0 0"/><axis xyz="0 0 1"/></joint>')
 
 
-def urdf(path, content=None, **changed):
+def urdf(path, joint=None, geometry=BOX, **changed):
     """Write a URDF file, of a red box of 8 x 6 x 5 cm unless told otherwise -> its path."""
-    content = content or link("a", changed.pop("geometry", BOX), **changed)
+    content = jointed(joint) if joint else link("a", geometry, **changed)
     path.parent.mkdir(exist_ok=True)
     path.write_text(f'<robot name="r">{content}</robot>')
     return path
@@ -58,7 +58,7 @@ def urdf(path, content=None, **changed):
     (dict(geometry='<sphere radius="0.03"/>', place="0.01 0 0"), 0.04, 0.04, 0.03, 0.06, 0.5),
     (dict(geometry='<capsule radius="0.02" length="0.06"/>', turn="0 1.5707963 0"), 0.05, 0.05, 0.02, 0.04, 0.4),
     (dict(geometry='<mesh filename="wedge.obj" scale="0.5 0.5 0.5"/>'), 0.04, 0.04, 0, 0.02, 0),
-    (dict(content=jointed("fixed")), 0.05, 0.05, 0.02, 0.04, 0.4)], ids=str)
+    (dict(joint="fixed"), 0.05, 0.05, 0.02, 0.04, 0.2775)], ids=str)
 def test_extents_by_hand(tmp_path, changed, radius, reach, below, height, roundness):
     (tmp_path / "wedge.obj").write_text(WEDGE)
     bullet = new_world()
@@ -66,7 +66,8 @@ def test_extents_by_hand(tmp_path, changed, radius, reach, below, height, roundn
     expected = [radius, reach, below, height, roundness]
     names = "radius", "reach", "below", "height", "roundness"
     for name, value in zip(names, expected):
-        assert getattr(found, name) == pytest.approx(value, abs=2e-4), f"{name}: of the shape's middle, not of mass?"
+        assert getattr(found, name) == pytest.approx(value, abs=2e-3 if name == "roundness" else 2e-4), (
+            f"{name}: about the middle of the shape, not that of its mass?")
     assert (found.roundness > ROUND) == (roundness > 0.9)
     angle, turn = 0.7, bullet.getBasePositionAndOrientation(body)[1]
     turned = bullet.multiplyTransforms([0] * 3, [0, 0, np.sin(angle / 2), np.cos(angle / 2)], [0] * 3, turn)[1]
@@ -74,20 +75,21 @@ def test_extents_by_hand(tmp_path, changed, radius, reach, below, height, roundn
     again = measure(bullet, body)
     for name, value in zip(names, expected):
         tolerance = 0.02 if name == "roundness" else 2e-4  # it is looked at from 180 sides
-        assert getattr(again, name) == pytest.approx(value, abs=tolerance), f"{name} changes where it is turned or moved"
+        assert getattr(again, name) == pytest.approx(value, abs=tolerance), f"{name} changes with place and turn"
     bullet.disconnect()
 
 
 def test_kinds_are_measured_as_any_body_is():
-    with Arena(Settings(kinds=("can", "pot", "carton"), objects_min=5, objects_max=5, width=16, height=12),
-               np.random.default_rng(1)) as arena:
-        arena.new_scene()
-        assert set(arena.kinds) == {"can", "pot", "carton"}
-        for kind, radius, is_round, body in zip(arena.kinds, arena.radii, arena.round, arena.bodies):
-            assert is_round == (kind == "can")
-            assert radius < {"can": 0.0341, "pot": 0.0421, "carton": 0.0505}[kind]
-            low, high = arena.bullet.getAABB(body)
-            assert np.hypot(*np.subtract(high, low)[:2]) / 2 < 1.45 * radius
+    sizes = {"can": (0.0239, 0.0341), "pot": (0.0299, 0.0421), "carton": (0.0344, 0.0506), "bracket": (0.04, 0.08)}
+    seen = set()
+    with Arena(Settings(kinds=tuple(sizes), width=16, height=12), np.random.default_rng(1)) as arena:
+        for _ in range(6):
+            arena.new_scene()
+            seen |= set(arena.kinds)
+            for kind, radius, is_round in zip(arena.kinds, arena.radii, arena.round, strict=True):
+                assert is_round == (kind == "can"), kind
+                assert sizes[kind][0] < radius < sizes[kind][1], kind
+    assert seen == set(sizes)
 
 
 # --- in the arena ---------------------------------------------------------------------------------------------
@@ -165,17 +167,18 @@ def test_data_sets_know_their_objects_by_content_wherever_the_files_lie(tmp_path
     urdf(tmp_path / "here" / "box.urdf")
     shutil.copytree(tmp_path / "here", tmp_path / "there")
     for folder in ("here", "there"):
-        settings = Settings(own=read_urdfs([tmp_path / folder / "*.urdf"], 0.9), **FAST)
+        settings = Settings(own=read_urdfs([tmp_path / folder / "*.urdf"], 0.8), **FAST)
         with parallel_map(1 if folder == "here" else 2) as spread:
             collect(tmp_path / f"from {folder}", 6, 1, settings, spread)
     shards = [sorted((tmp_path / f"from {folder}").iterdir()) for folder in ("here", "there")]
-    assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]] and len(shards[0]) == 4
+    assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]]
+    assert len(shards[0]) == 4
     own = collection.load_shard(shards[0][0]).settings["own"]
-    assert [(each["name"], each["scale"]) for each in own] == [("box.urdf", 0.9), ("wedge.urdf", 0.9)]
+    assert [(each["name"], each["scale"]) for each in own] == [("box.urdf", 0.8), ("wedge.urdf", 0.8)]
     assert str(tmp_path) not in json.dumps(own)
     (tmp_path / "here" / "wedge.obj").write_text(WEDGE.replace("0.04", "0.05"))  # the mesh, not the URDF itself
     bodies.contents.cache_clear()
-    changed = Settings(own=read_urdfs([tmp_path / "here" / "*.urdf"], 0.9), **FAST)
+    changed = Settings(own=read_urdfs([tmp_path / "here" / "*.urdf"], 0.8), **FAST)
     assert [a["checksum"] == b["checksum"] for a, b in zip(changed.plain["own"], own)] == [True, False]
     with pytest.raises(ValueError, match="other settings"):
         collect(tmp_path / "from here", 6, 1, changed)
@@ -190,19 +193,22 @@ def test_a_task_can_be_made_of_own_objects(tmp_path):
     with random_task(4, 2, settings=Settings(**{**vars(SETTINGS), "kinds": (), "own": own})) as task:
         assert set(task.arena.kinds) <= {"a.urdf", "b.urdf"} and len(task.movers) == 2
         assert task.arena.round == [kind == "b.urdf" for kind in task.arena.kinds]
+    assert cli.main(["plan", "--urdf", str(tmp_path / "?.urdf"), "--scale", "0.9", "--policy", "greedy", "--budget",
+                     "1", "--out", str(tmp_path / "plan")]) == 0
+    assert (tmp_path / "plan" / "plan.gif").exists()
 
 
 # --- what is refused ------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("changed, words", [
     (None, "nothing.urdf: expected a URDF file, got nothing there"),
-    ("", "a.urdf: expected a URDF file, got an empty file"),
+    ("", "a.urdf: expected a URDF file, got an empty one"),
     ("hello", "a.urdf: Bullet cannot load it: expected a URDF file"),
     ("<mujoco/>", "a.urdf: Bullet cannot load it: expected a URDF file"),
     (dict(geometry='<mesh filename="no.obj"/>'), "a.urdf: Bullet cannot load it: it names no.obj, which is not there"),
     (dict(mass=0), "a.urdf: has no mass"),
-    (dict(content=jointed("continuous")), "a.urdf: has joints that move; expected one rigid body"),
-    (dict(content=link("a", BOX).partition("<collision")[0] + "</link>"), "a.urdf: has no shape of finite size"),
+    (dict(joint="continuous"), "a.urdf: has joints that move; expected one rigid body"),
+    (dict(solid=False), "a.urdf: has no shape of finite size"),
     (dict(geometry='<plane normal="0 0 1"/>'), "a.urdf: expected boxes, spheres"),
     (dict(geometry='<box size="0.2 0.06 0.05"/>'), "a.urdf: reaches 0.107 m from its middle and is 0.050 m high as it "
                                                    "stands; expected at most .*; none is too large at a scale of 0.6"),
@@ -230,10 +236,10 @@ def test_of_many_files_the_first_is_named_the_others_counted_and_a_scale_is_prop
         read_urdfs([tmp_path / "?.urdf"])
     assert len(read_urdfs([tmp_path / "?.urdf"], 0.34)) == 3
     with pytest.raises(ValueError, match="a folder"):
-        read_urdfs([tmp_path])
+        read_urdfs(tmp_path)
 
 
-@pytest.mark.parametrize("scale", [0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("scale", [0, -1.0, float("nan"), float("inf"), "1", None])
 def test_scales_that_cannot_be_are_refused(scale):
     with pytest.raises(ValueError, match="^scale: expected a finite number > 0, got "):
         read_urdfs([], scale)

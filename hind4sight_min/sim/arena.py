@@ -59,11 +59,11 @@ class Settings:
                 raise ValueError(f"{name}: expected a finite number > 0, got {value}")
         cells, length = self.arena / self.cell, self.poke_length
         paths = isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena
+        own = isinstance(self.own, tuple) and all(hasattr(each, "add") and hasattr(each, "plain") for each in self.own)
         for good, name, expected in (
                 (self.objects_min <= self.objects_max <= MAX_OBJECTS, "objects_max", f"objects_min to {MAX_OBJECTS}"),
                 ((self.kinds or self.own) and set(self.kinds) <= set(KINDS), "kinds", f"some of {', '.join(KINDS)}"),
-                (isinstance(self.own, tuple) and all(hasattr(each, "add") and hasattr(each, "plain") for each in self.own),
-                 "own", "a tuple of objects that have add and plain, as read_urdfs makes them"),
+                (own, "own", "a tuple of what read_urdfs makes, or of other objects that have add and plain"),
                 (self.textures and set(self.textures) <= set(TEXTURES), "textures", f"some of {', '.join(TEXTURES)}"),
                 (self.arena <= 0.5, "arena", "at most 0.5 m, which the camera sees"),
                 (abs(cells - round(cells)) < 1e-6, "cell", "one that the arena has a whole number of"),
@@ -104,10 +104,11 @@ def arena_camera(width, height):
 class Arena:
     """One Bullet world: a walled table, a finger on three prismatic joints, a camera. A context manager.
 
-    Of the present scene's objects: bodies, Bullet's numbers; kinds, of own objects their names; as they lay when the
-    scene began, radii, how far they reach from their middle in the plane, m, and round, whether their turn about the
-    vertical can be seen by nothing but their colours. empty_depth (H, W) m: the arena without any. bullet: Bullet's functions, for this world. All is drawn from the
-    Generator `rng`. Raises RuntimeError where pybullet is not installed.
+    Of the present scene's objects: bodies, Bullet's numbers; kinds, names of own objects among them; and, measured as
+    they lay when the scene began, radii, how far they reach from their middles in the plane, m, and round, whether
+    their shape would hide a turn about the vertical. empty_depth (H, W) m: the arena without any. bullet: Bullet's
+    functions, for this world. All is drawn from the Generator `rng`. Raises RuntimeError where pybullet is not
+    installed.
     """
 
     def __init__(self, settings, rng):

@@ -1,9 +1,9 @@
-"""Bodies in Bullet, whatever they were made from: how large they are, how round, and whether they can be poked here;
-and those of one's own, loaded from URDF files. Not in the paper.
+"""Bodies in Bullet, whatever made them: how large they are, how round, whether they can be poked here; and objects of
+one's own, of URDF files. Not in the paper.
 
-Anything hashable will do as an object of one's own (`Settings.own`) that has `add(bullet, rng)`, which makes a body in
-a world and returns its number, and `plain`, a dict of plain JSON types with a "name": what data sets say of it. Its
-class lies in a module, so that other processes can import it.
+An object of one's own (in `Settings.own`) is anything that has `add(bullet, rng)`, which makes a body in a world and
+returns its number, and `plain`, a dict of plain JSON types with a "name": what data sets say of it. Its class has to be
+in a module, for other processes to import.
 """
 import glob
 import importlib
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isbuiltin
 from itertools import product
+from numbers import Real
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -117,22 +118,10 @@ def measure(bullet, body):
                   reach.min() / radius)
 
 
-class TooLarge(ValueError):
-    """A body that is too large. room: how many times as large it could be, less than 1."""
-
-    def __init__(self, extent):
-        super().__init__(f"reaches {extent.reach:.3f} m from its middle and is {extent.height:.3f} m high as it stands; "
-                         f"expected at most {LARGEST:g} and {TALL:g} m")
-        self.room = room(extent)
-
-
-def room(extent):
-    """How many times as large something could be: an Extent -> float."""
-    return 1 / max(extent.reach / LARGEST, extent.height / TALL)
-
-
 def check_pokable(bullet, body):
-    """Measure a body that was just made -> Extent. Raises ValueError, saying why, for one that cannot be poked here."""
+    """Measure a body that was just made -> Extent. Raises ValueError, saying why, for one that cannot be poked here;
+    where it is too large, the error's `room` says how many times as large it could be.
+    """
     if any(bullet.getJointInfo(body, joint)[2] != bullet.JOINT_FIXED for joint in range(bullet.getNumJoints(body))):
         raise ValueError("has joints that move; expected one rigid body")
     if not bullet.getDynamicsInfo(body, -1)[0] > 0:
@@ -140,8 +129,12 @@ def check_pokable(bullet, body):
     extent = measure(bullet, body)
     if extent.height < FLAT:
         raise ValueError(f"is {extent.height:.4f} m high as it stands; expected {FLAT:g} m or more, or it is not seen")
-    if room(extent) < 1:
-        raise TooLarge(extent)
+    room = 1 / max(extent.reach / LARGEST, extent.height / TALL)
+    if room < 1:
+        error = ValueError(f"reaches {extent.reach:.3f} m from its middle and is {extent.height:.3f} m high as it "
+                           f"stands; expected at most {LARGEST:g} and {TALL:g} m")
+        error.room = room
+        raise error
     return extent
 
 
@@ -224,16 +217,19 @@ def read_urdfs(paths, scale=1.0):
     scale: how many times as large as they say. Raises ValueError that names the first that cannot be used, says why and
     how many there are.
     """
-    if not 0 < scale < float("inf"):
-        raise ValueError(f"scale: expected a finite number > 0, got {scale}")
+    if not (isinstance(scale, Real) and 0 < scale < float("inf")):
+        raise ValueError(f"scale: expected a finite number > 0, got {scale!r}")
     bullet, found, wrong, least = new_world(), [], [], 1.0
+    paths = [paths] if isinstance(paths, (str, Path)) else paths
     files = [os.path.abspath(file) for path in paths for file in files_named(str(path))]
     for path in files:
         try:
-            if not os.path.isfile(path) or not os.path.getsize(path):
-                kind = "a folder" if os.path.isdir(path) else "an empty file" if os.path.exists(path) else "nothing there"
-                raise ValueError(f"{path}: expected a URDF file, got {kind}")
-            found.append(Urdf(path, scale, contents(path)[0]))
+            if not os.path.isfile(path):
+                raise ValueError(f"{path}: expected a URDF file, got "
+                                 f"{'a folder' if os.path.isdir(path) else 'nothing there'}")
+            if not os.path.getsize(path):
+                raise ValueError(f"{path}: expected a URDF file, got an empty one")
+            found.append(Urdf(path, float(scale), contents(path)[0]))
             bullet.removeBody(add_own(bullet, found[-1], None)[0])
         except ValueError as error:
             wrong.append(str(error))
