@@ -21,10 +21,15 @@ from ..interactions import grid_shape
 from ..losses import distance_maps, seen_in_both, warp_backward
 from .evaluation import MOVING, true_motion
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart: one per mask (or object).
-PALETTE = np.array([(230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178),
-                    (213, 94, 0)]) / 255
-PREDICTED, TRUE, GOAL, POKE = PALETTE[5], PALETTE[6], PALETTE[4], "black"
+# --- the palette of every picture ------------------------------------------------------------------------
+# Okabe and Ito's colours: readers with any of the common colour-vision deficiencies tell each from each.
+ORANGE, SKY, GREEN, PINK, YELLOW, BLUE, RED = np.array([
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178), (213, 94, 0)]) / 255
+PALETTE = np.array([ORANGE, SKY, BLUE, RED, YELLOW, GREEN, PINK])  # one per mask or object; least like grey first
+PREDICTED, TRUE, GOAL, POKE = BLUE, RED, YELLOW, "black"
+TERM_COLOURS = {"chamfer": BLUE, "distance_smoothness": SKY, "photometric": RED, "flow_smoothness": ORANGE,
+                "inverse": GREEN, "binary_masks": PINK}
+DISTANCES, ERRORS, SHARES = "viridis", "magma", "cividis"  # colour maps: brighter is more, to every eye
 OUTLINE = [withStroke(linewidth=3.5, foreground="white"), Normal()]  # lines stay visible on any picture
 
 
@@ -162,7 +167,7 @@ def _draw_heatmap(axes, heatmap, place, arena, which, symbol):
     """A heat-map over the arena's cells, and the true place (2,) m in it."""
     half = arena / 2
     axes.set(title=f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)", **ARENA)
-    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
+    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap=SHARES, vmin=0,
                         extent=(-half, half, -half, half))
     axes.plot(*place, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
               label=f"true {which}")
@@ -180,14 +185,14 @@ def _draw_losses(panels, answer):
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
-                       cmap=colormaps["magma"].with_extremes(bad="0.6"), vmin=0)
+                       cmap=colormaps[ERRORS].with_extremes(bad="0.6"), vmin=0)
     panels["error"].figure.colorbar(shown, ax=panels["error"], label="sum over R, G, B", **BELOW)
     distances = 100 * np.sqrt(distance_maps(answer.prediction.points, after.points, valid, next_valid))  # cm
     both = [panels["distance_predicted"], panels["distance_observed"]]
     titles = "predicted to observed\n$D_{\\hat P \\to P}$", "observed to predicted\n$D_{P \\to \\hat P}$"
     for axes, title, distance in zip(both, titles, distances):
-        shown = show_image(axes, distance.reshape(error.shape), f"Distance {title} (Eq. 2)", vmin=0,
-                           vmax=distances.max())
+        shown = show_image(axes, distance.reshape(error.shape), f"Distance {title} (Eq. 2)", cmap=DISTANCES,
+                           vmin=0, vmax=distances.max())
     both[0].figure.colorbar(shown, ax=both, label="square root of D, cm", **BELOW)
 
 
@@ -262,7 +267,8 @@ def training_figure(log, no_motion={}):
     for i, name in enumerate(names):
         axes = figure.add_subplot(rows, columns, i + 1, label=name)
         values = [entry[name] for entry in log]
-        axes.plot([entry["step"] for entry in log], values, ".-", color=PREDICTED, markersize=5, linewidth=1.5)
+        axes.plot([entry["step"] for entry in log], values, ".-", color=TERM_COLOURS.get(name, "black"), markersize=5,
+                  linewidth=1.5)
         if name in no_motion:
             axes.axhline(no_motion[name], linestyle="--", color="0.4", linewidth=1.2, label="no motion")
             axes.legend(fontsize=8)
@@ -384,8 +390,8 @@ def save_film(path, frames, seconds):
 
 
 STYLES = {"learned": ("learned model, mean", PREDICTED, "-"),
-          "oracle": ("the simulator as the model", PALETTE[2], "--"),
-          "random": ("random pokes", PALETTE[3], ":"), "no_motion": ("model of no motion", "0.4", "-.")}
+          "oracle": ("the simulator as the model", GREEN, "--"),
+          "random": ("random pokes", PINK, ":"), "no_motion": ("model of no motion", "0.4", "-.")}
 
 
 def control_figure(curves, pokes):
