@@ -1,4 +1,4 @@
-"""The `hind4sight` command: collect, import, train, evaluate, show, plan, demo and more; `COMMAND --help`."""
+"""The `hind4sight` command: collect, import, train, evaluate, show, explore, plan, demo and more; `COMMAND --help`."""
 import argparse
 import json
 import os
@@ -231,6 +231,11 @@ def run_show(args):
     print(f"{args.out}: interaction {row}")
 
 
+def run_explore(args):
+    from .explore import run_explore
+    run_explore(args)
+
+
 def run_reproduce(args):
     from . import figures
     out = Path(args.out or (f"runs/{args.table}" if args.table in ("planning", "contact")
@@ -441,6 +446,16 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
     "show": (run_show, "one interaction as a picture; without arguments, a shipped one", {
         "checkpoint": SHIPPED, "data": TEST, "--out": {"default": "interaction.png"},
         "--row": {"type": int, "help": "which interaction (one that moves something well)"}}),
+    "explore": (run_explore, "a window to poke in with the mouse: what the model predicts follows (without pybullet in "
+                "the shipped pokes)", {
+        "checkpoint": SHIPPED,
+        "data": {"nargs": "?", "help": "a folder of pokes to explore, in place of the simulator"},
+        "--seed": {**SEED, "help": "which scene"},
+        "--mine": {"nargs": "+", "default": (), "metavar": "FOLDER", "help": "take what a student wrote there in "
+                   "place of the reference's functions; their code runs with all your rights"},
+        "--script": {"metavar": "FILE", "help": "no window: do what the file says (docs/explorer.md)"},
+        "--demo": {"metavar": "OUT.gif", "help": "no window: film the script, or one of our own"},
+        "--out": {"default": ".", "help": "folder for saved pictures"}}),
     "plan": (run_plan, "plan pokes to a goal and carry them out, in a test scene (needs pybullet)", {
         "checkpoint": SHIPPED,
         "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
