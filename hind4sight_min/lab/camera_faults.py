@@ -144,8 +144,8 @@ def along_walls(camera, empty_depth, settings):
 
 
 def prepared(interactions):
-    """Pokes as a robot with a real camera gives them to the model: depth smooth, holes filled, and the pose corrected by
-    the empty arena, as far as that shows it. A record in, a record out.
+    """Pokes as a robot with a real camera gives them to the model: depth smooth, holes filled, and the pose corrected
+    by the empty arena, as far as that shows it. A record in, a record out.
     """
     empty, settings = interactions.empty_depth, interactions.settings
     camera = level(interactions.camera, empty)
