@@ -1,11 +1,12 @@
 """What real cameras do wrong beside noise, and what a robot does about it before it looks: missing depth is filled in,
-a pose that is not quite right levelled by the table. Not in the paper, whose depth is complete and whose pose is known.
+a pose that is not quite right corrected by the empty arena's table and walls. Not in the paper, whose depth is complete
+and whose pose is known.
 """
 from dataclasses import replace
 
 import numpy as np
 
-from ..geometry import so3_exp, unproject
+from ..geometry import rigid, so3_exp, unproject
 from ..training import unsupervised
 from .noise import add_depth_noise, smooth_depth
 
@@ -114,10 +115,42 @@ def level(camera, empty_depth):
     return replace(camera, arena_from_camera=pose)
 
 
-def prepared(interactions):
-    """Pokes as a robot with a real camera gives them to the model: level, smooth, holes filled. A record in, one out.
+WALL = 0.02, 0.035  # m: how thick the simulator's walls are, and how far from where they stand they are looked for
+
+
+def along_walls(camera, empty_depth, settings):
+    """A level camera turned about the vertical and shifted along the table until the walls of the empty arena (H, W) m
+    stand where the settings have them.
+
+    Every point of a wall lies arena / 2 to arena / 2 + WALL from the middle, along x or along y: Gauss-Newton steps on
+    what is missing to that. What is as high as the walls and near there is taken for one.
     """
-    camera, empty = level(interactions.camera, interactions.empty_depth), interactions.empty_depth
+    near, far = settings["arena"] / 2, settings["arena"] / 2 + WALL[0]
+    points = unproject(empty_depth.astype(float), camera)[empty_depth > 0]
+    height, out = points[:, 2] / settings["wall_height"], np.abs(points[:, :2]).max(axis=1)
+    walls = points[(height > 0.3) & (height < 1.5) & (out > near - WALL[1]) & (out < far + WALL[1])]
+    moved = np.eye(4)
+    for _ in range(10):
+        xy = rigid(walls, moved)[:, :2]
+        out = np.abs(xy).max(axis=1)
+        missing = np.maximum(near - out, 0) + np.minimum(far - out, 0)
+        outwards = np.sign(xy) * (np.abs(xy) == out[:, None]) * (missing != 0)[:, None]
+        slopes = np.column_stack([outwards, outwards[:, 1] * xy[:, 0] - outwards[:, 0] * xy[:, 1]])
+        dx, dy, turn = np.linalg.lstsq(slopes, missing, rcond=None)[0]
+        step = np.eye(4)
+        step[:3, :3], step[:2, 3] = so3_exp(np.array([0, 0, turn])), (dx, dy)
+        moved = step @ moved
+    return replace(camera, arena_from_camera=moved @ camera.arena_from_camera)
+
+
+def prepared(interactions):
+    """Pokes as a robot with a real camera gives them to the model: depth smooth, holes filled, and the pose corrected
+    by the empty arena, as far as that shows it. A record in, a record out.
+    """
+    empty, settings = interactions.empty_depth, interactions.settings
+    camera = level(interactions.camera, empty)
+    if settings.get("wall_height"):
+        camera = along_walls(camera, empty, settings)
     seen = {f"depth_{name}": smooth_depth(getattr(interactions, f"depth_{name}"), empty,
                                           getattr(interactions, f"rgb_{name}"), interactions.camera)
             for name in ("before", "after")}
@@ -126,13 +159,14 @@ def prepared(interactions):
 
 # --- training ----------------------------------------------------------------------------------------------------
 
-TRAINED = {"depth_noise": 0.01, "missing": (0.3, *ONE_SIDED), "pose_error": (1.0, 0.01)}
+# The faults of `with_faults`, and which share of the chunks comes with each: what costs the most comes most often.
+TRAINED = {"depth_noise": (0.01, 0.75), "missing": ((0.3, *ONE_SIDED), 0.25), "pose_error": ((1.0, 0.01), 0.5)}
 
 
 def under_faults(params, recipe, interactions, rng, objective=unsupervised):
     """A training objective on pictures with faults, drawn anew in every step: for `training.train`.
 
-    Each fault of TRAINED comes with half of the chunks, so that the model also knows a camera without it.
+    Every fault of TRAINED comes with its share of the chunks, so that the model also knows a camera without it.
     """
-    drawn = {name: value for name, value in TRAINED.items() if rng.random() < 0.5}
+    drawn = {name: value for name, (value, share) in TRAINED.items() if rng.random() < share}
     return objective(params, recipe, prepared(with_faults(interactions, rng, **drawn)), rng)
