@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RUNS = {  # benchmark -> what it needs, its arguments, figures that must be among those it records
     "startup": ((), (), ("import_seconds", "import_command_line_seconds", "first_picture_seconds_max")),
     "collection": (("pybullet",), ("--pokes", "2"), ("collect_jobs2_speedup_min", "collect_share_in_bullet")),
+    "explorer": ((), (), ("explorer_ms", "explorer_ms_max", "explorer_poke_ms")),
     "planning": (("pybullet",), ("--before", ROOT), ("plan_candidates_per_second", "plan_speedup_vs_before")),
     "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1", "--only",
                                                     "ours", "torch_1_threads", "point_cloud_utils", "scipy"),
