@@ -254,7 +254,7 @@ class Explorer:
             self.art.elites.set_segments(lines[:search.elites])
             self.art.others.set_segments(lines[search.elites:])
             self.art.arrows[0].set_alpha(0)
-            self.say(f"CEM, round {iteration + 1} of {search.iterations}: the model was asked about {len(pokes)} pokes. "
+            self.say(f"CEM, round {iteration + 1} of {search.iterations}: the model is asked about {len(pokes)} pokes. "
                      f"Around the best {search.elites}, yellow, the next are drawn. Lowest cost {costs.min():.2f}.")
             self.paint()
             self.canvas.flush_events()
