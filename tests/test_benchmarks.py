@@ -18,6 +18,7 @@ RUNS = {  # benchmark -> what it needs, its arguments, figures that must be amon
     "collection": (("pybullet",), ("--pokes", "2"), ("collect_jobs2_speedup_min", "collect_share_in_bullet")),
     "roundtrip": (("pybullet",), ("--pokes", "4", "--size", "128", "96"), ("roundtrip_mm", "roundtrip_pose_mm",
                                                                        "roundtrip_flow_mse_ratio_64")),
+    "explorer": ((), (), ("explorer_ms", "explorer_ms_max", "explorer_poke_ms")),
     "planning": (("pybullet",), ("--before", ROOT), ("plan_candidates_per_second", "plan_speedup_vs_before")),
     "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1", "--only",
                                                     "ours", "torch_1_threads", "point_cloud_utils", "scipy"),

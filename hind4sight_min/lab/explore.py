@@ -4,7 +4,6 @@ It draws on any Matplotlib figure: in a window, in a notebook, or in memory, whe
 follows the mouse is drawn alone, over a copy of all the rest ("blitting").
 """
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +16,18 @@ from ..course.carve import take_written
 from ..course.task import described
 from ..disk.checkpoints import load_run
 from ..disk.files import check_output
-from ..disk.shards import load_interactions
 from ..geometry import optical_flow, project, rigid
 from ..interactions import occupied_grid
 from ..losses import chamfer_loss, distance_maps, seen_in_both
 from ..networks import predict
-from ..planning import Search, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll, view_of
+from ..planning import Search, first_start, goal_of, learned_step, plan, possible_starts, roll, view_of
 from ..scene import scene_of
-from ..sim.truth import find_truth
 from ..training import check_camera
 from . import figures
 from .cli import data_small
-from .control import settings_for
 from .evaluation import MOVING
 from .marks import at_height, follow, places_at, points_at
-from .worlds import Recorded, Simulated
+from .worlds import world_of
 
 
 KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goal marks  [g]", "p": "plan  [p]",
@@ -41,7 +37,7 @@ SAME = 0.03  # m; a mark takes the place of one so near
 
 
 class Explorer:
-    """All that happens on an empty figure with a canvas. world: Simulated or Recorded; run: the checkpoint; out: folder
+    """All that happens on an empty figure with a canvas. world: of worlds.py; run: the checkpoint; out: folder
     for saved pictures; yours: names of a student's functions that are at work.
 
     poke (3,), prediction, flow (H, W, 2) px: what is drawn. scene, view: what the camera sees now, without and with
@@ -59,38 +55,39 @@ class Explorer:
         self.rng, self.saved, self.frames, self.held, self.marking = np.random.default_rng(0), 0, None, None, False
         if self.canvas.manager:  # Matplotlib's own keys mean something else
             self.canvas.mpl_disconnect(self.canvas.manager.key_press_handler_id)
-        for name, action in (("button_press", self._press), ("motion_notify", self._move), ("key_press", self._key),
-                             ("button_release", self._release)):
-            self.canvas.mpl_connect(f"{name}_event", partial(self._handle, action))
-        self.canvas.mpl_connect("draw_event", self._drawn)
-        self.look()
-        self.show_scene()
+        for name, action in (("draw", self._drawn), ("button_press", partial(self.attempt, self._press)),
+                             ("motion_notify", self._move), ("button_release", self._release),
+                             ("key_press", partial(self.attempt, self._key))):
+            self.canvas.mpl_connect(f"{name}_event", action)
+        self.canvas.draw()
+        self.attempt(self.look)
+        self.attempt(self.show_scene)
 
     # --- drawing ---
 
-    def _drawn(self, event):  # all of it, perhaps in another size
+    def _drawn(self, event):  # the rest has been, perhaps in another size
         if not self.canvas.is_saving():
             self.background = self.canvas.copy_from_bbox(self.figure.bbox)
-            self._draw_live()
+            self.paint(blit=False)
 
-    def _draw_live(self):
-        for artist in self.art.live:
-            self.figure.draw_artist(artist)
-
-    def paint(self):
+    def paint(self, blit=True):
         """Put what follows the mouse over a copy of the rest."""
         self.canvas.restore_region(self.background)
-        self._draw_live()
+        for artist in self.art.live:
+            self.figure.draw_artist(artist)
+        if not blit:
+            return
         self.canvas.blit(self.figure.bbox)
         if self.frames is not None:
             self.frames.append(np.array(self.canvas.buffer_rgba())[..., :3])
 
     def look(self):
-        """Look at the world. The other panels go on to show what was: `stale`."""
-        rgb, depth = self.world.look()
+        """Look at the world; until `show_scene` the other panels show what was: they are stale."""
+        rgb, depth, photograph = self.world.look()
         self.scene = scene_of(depth[None], rgb[None], self.world.empty_depth, self.camera, self.settings["arena"])
-        self.view, self.goals, self.stale = view_of(self.scene, np.zeros((0, 3))), np.zeros((0, 2)), True
-        self.art.images["camera"].set_data(rgb)
+        self.set_marks(np.zeros((0, 3)), np.zeros((0, 2)))
+        self.stale = True
+        self.art.images["camera"].set_data(photograph)
 
     def show_scene(self):
         """Draw what is looked at in all panels, with a poke to begin with."""
@@ -101,8 +98,9 @@ class Explorer:
         self.art.points.set(offsets=self.scene.points[0, valid, :2], color=0.45 + 0.55 * image.reshape(-1, 3)[valid])
         self.art.true.set_segments([])
         self.poke, self.stale = self.world.suggested, False
-        if self.poke is None:
-            self.poke = draw_pokes(self.rng, 1, self.view, self.settings)[0, 0]
+        if self.poke is None:  # one at some object, away from the camera
+            objects = self.scene.points[0, self.scene.occupied[0]]
+            self.poke = np.float32([*objects[len(objects) // 2, :2], np.pi / 2])
         self.ask()
         self.canvas.draw()
 
@@ -117,7 +115,7 @@ class Explorer:
         images["masks"].set_data(figures.blend(image, masks[:, 1:].reshape(*size, -1)))
         images["flow"].set_data(figures.flow_to_rgb(self.flow, figures.SHOWN / self.camera.pixel_size))
         images["predicted"].set_data(figures.next_picture(image, self.flow, depth))
-        self.art.predicted.set_segments(scene_flow_lines(points, predicted - points, valid))
+        self.art.predicted.set_segments(figures.scene_flow_lines(points, predicted - points, valid))
         grid = occupied_grid(self.view.cloud[None], self.view.occupied, self.settings)
         start = first_start(possible_starts(self.poke[None], grid, self.settings))[0]
         self.draw_poke(start)
@@ -144,9 +142,10 @@ class Explorer:
 
     # --- what mouse and keys do ---
 
-    def _handle(self, action, event):  # what cannot be is said in a line, as is what is wrong with a student's code
+    def attempt(self, action, *given):
+        """Do it and draw. What cannot be is said in a line, as is what is wrong with a student's code."""
         try:
-            action(event)
+            action(*given)
         except Exception as error:
             if not (self.yours or isinstance(error, ValueError)):
                 raise
@@ -160,15 +159,16 @@ class Explorer:
         if event.inaxes is self.art.axes["camera"]:
             if self.stale:
                 self.show_scene()
-            self.held = self.mark if self.marking or event.button == 3 else self.aim, (event.xdata, event.ydata)
+            action, place = self.mark if self.marking or event.button == 3 else self.aim, [event.xdata, event.ydata]
+            self.held = partial(self.attempt, action, np.array(place))
             self._move(event)
 
     def _move(self, event):
         if self.held and event.inaxes is self.art.axes["camera"]:
-            action, place = self.held
-            action(np.array(place), np.array([event.xdata, event.ydata]))
+            self.held(np.array([event.xdata, event.ydata]))
 
     def _release(self, event):
+        self._move(event)
         self.held = None
 
     def _key(self, event):
@@ -205,10 +205,13 @@ class Explorer:
         point = points_at(place[None], self.scene, self.camera)
         far = np.linalg.norm(places_at(to[None], point[:, 2], self.camera, self.settings) - point[:, :2])
         others = np.linalg.norm(self.view.marks - point, axis=1) > SAME
-        self.view = view_of(self.scene, np.vstack([self.view.marks[others], point]))
-        self.goals = np.vstack([self.goals[others], to])
+        self.set_marks(np.vstack([self.view.marks[others], point]), np.vstack([self.goals[others], to]))
         self.ask()
         self.say(f"{len(self.goals)} to move, this one by {100 * far:.0f} cm. p plans.")
+
+    def set_marks(self, marks, goals):
+        """Marked points (M, 3) m, and the pixels (M, 2) where they shall go."""
+        self.view, self.goals = view_of(self.scene, marks), goals
 
     def carry_out(self):
         """Poke, and show what is true beside what was predicted."""
@@ -224,18 +227,19 @@ class Explorer:
         said = (f"Chamfer distance (Eq. 2): {1e4 * chamfer_loss(*maps)[0]:.0f} cm\u00b2, had nothing moved "
                 f"{1e4 * chamfer_loss(*still)[0]:.0f}.")
         if true is not None:
-            self.art.true.set_segments(scene_flow_lines(points[0], true, scene.valid[0]))
+            self.art.true.set_segments(figures.scene_flow_lines(points[0], true, scene.valid[0]))
             length, error = 100 * np.linalg.norm([true, predicted[0] - points[0] - true], axis=2)  # cm
             moving = scene.valid[0] & (length > 100 * MOVING)
             self.error = error[moving if moving.any() else scene.valid[0]].mean()
             said = (f"The points moved {length[moving].mean():.1f} cm" if moving.any() else "Nothing moved") + (
                 f", the prediction is off by {self.error:.1f} cm. {said}")
         if len(goals):
-            self.view, self.goals = view_of(after, follow(view, self.prediction, after)), goals
+            self.set_marks(follow(view, self.prediction, after), goals)
             left = at_height(goals, self.view.marks[:, 2], self.camera) - self.view.marks[:, :2]
             said = f"{100 * np.linalg.norm(left, axis=1).mean():.1f} cm to go. {said}"
         self.draw_poke(start)
         self.say(said)
+        self.canvas.draw()
 
     def plan(self):
         """Find a poke by the cross entropy method; its candidates are drawn as they narrow, round by round."""
@@ -249,8 +253,9 @@ class Explorer:
             lines = figures.arrow_lines(*figures.on_table(ends, self.camera))
             self.art.elites.set_segments(lines[:search.elites])
             self.art.others.set_segments(lines[search.elites:])
-            self.say(f"CEM, round {iteration + 1} of {search.iterations}: {len(pokes)} pokes tried in the model; the best "
-                     f"{search.elites}, yellow, say where to try next. Lowest cost: {costs.min():.2f}")
+            self.art.arrows[0].set_alpha(0)
+            self.say(f"CEM, round {iteration + 1} of {search.iterations}: the model is asked about {len(pokes)} pokes. "
+                     f"Around the best {search.elites}, yellow, the next are drawn. Lowest cost {costs.min():.2f}.")
             self.paint()
             self.canvas.flush_events()
         rollout = partial(roll, learned_step(self.run, self.view), self.view, settings=self.settings)
@@ -271,19 +276,7 @@ def direction(pokes):
     return np.stack([np.cos(pokes[..., 2]), np.sin(pokes[..., 2])], axis=-1)
 
 
-def scene_flow_lines(points, flow, valid):
-    """Some of the points (N, 3) m that move, as arrows in the plane of the table: polylines (n, 5, 2)."""
-    moving = np.flatnonzero(valid & (np.linalg.norm(flow, axis=1) > MOVING))
-    moving = moving[::len(moving) // 30 + 1]
-    return figures.arrow_lines(points[moving, :2], (points + flow)[moving, :2])
-
-
 # --- the command, and a script in place of the mouse --------------------------------------------------------------
-
-DEMO = """
-wait 1
-"""
-
 
 def play(explorer, lines):
     """Do what the lines of a script say, by the events that mouse and keys make.
@@ -295,18 +288,20 @@ def play(explorer, lines):
     for number, line in enumerate(lines, 1):
         word, *rest = line.split("#")[0].split() or ["wait", 0]
         try:
+            events = []
             if word == "key":
-                events = [KeyEvent("key_press_event", canvas, {"space": " "}.get(*2 * rest))]
+                key, = [key for key in KEYS if rest == [key.replace(" ", "space")]]
+                events = [KeyEvent("key_press_event", canvas, key)]
             elif word == "wait":
-                events = []
+                seconds, = map(float, rest)
                 if explorer.frames:
-                    explorer.frames += explorer.frames[-1:] * round(10 * float(*rest))
+                    explorer.frames += explorer.frames[-1:] * round(10 * seconds)
             else:
-                x, y, *to = map(float, rest)
+                x, y, to_x, to_y = map(float, rest)
                 names = ["button_press_event", *7 * ["motion_notify_event"], "button_release_event"]
                 events = [MouseEvent(name, canvas, *camera.transform(place), {"drag": 1, "goal": 3}[word])
-                          for name, place in zip(names, np.linspace((x, y), to, len(names)))]
-        except (KeyError, TypeError, ValueError):
+                          for name, place in zip(names, np.linspace((x, y), (to_x, to_y), len(names)))]
+        except (KeyError, ValueError):
             raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, "
                              f"got {line.strip()!r}") from None
         for event in events:
@@ -321,18 +316,13 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
     """
     run = load_run(checkpoint or data_small() / "checkpoint.npz")
     yours = [name for folder in mine for name in take_written(folder)]
-    if data is None and find_spec("pybullet"):
-        world = Simulated(settings_for(run), seed)
-    else:
-        data = data or data_small() / "test"
-        world = Recorded(load_interactions(data), find_truth(data), seed)
     if figure is None:
         import matplotlib.pyplot as plt
         with rc_context({"toolbar": "None"}):
             figure = plt.figure("hind4sight explore", figsize=SIZE)
         if plt.get_backend().lower() == "agg":
             raise RuntimeError("no window can be opened here; --script FILE and --demo OUT.gif need none")
-    return Explorer(figure, world, run, out, yours)
+    return Explorer(figure, world_of(run, data, seed), run, out, yours)
 
 
 def run_explore(args):
@@ -349,7 +339,7 @@ def run_explore(args):
         check_output("--demo", args.demo, ".gif")
     explorer = explore(*given, FigureCanvasAgg(Figure(SIZE, dpi=100)).figure)
     explorer.frames = [] if args.demo else None
-    play(explorer, (Path(args.script).read_text() if args.script else DEMO).splitlines())
+    play(explorer, (Path(args.script).read_text() if args.script else explorer.world.demo).splitlines())
     if args.demo:
         figures.save_film(args.demo, explorer.frames, 0.1)
         print(f"{args.demo}: {len(explorer.frames) / 10:.0f} s")

@@ -128,6 +128,13 @@ def arrow_lines(starts, ends):
     return np.stack([starts, ends, ends + back + aside, ends, ends + back - aside], axis=1)
 
 
+def scene_flow_lines(points, flow, valid):
+    """Some of the points (N, 3) m that move, as arrows seen from above: polylines (n, 5, 2). Not in the paper."""
+    moving = np.flatnonzero(valid & (np.linalg.norm(flow, axis=1) > MOVING))
+    moving = moving[::len(moving) // 16 + 1]
+    return arrow_lines(points[moving, :2], (points + flow)[moving, :2])
+
+
 BELOW, ARENA = {"location": "bottom", "shrink": 0.8}, {"xlabel": "x [m]", "ylabel": "y [m]"}
 VIEW_RATIO = 1.6  # width to height of the scene flow panel
 
@@ -303,7 +310,7 @@ def explorer_panels(figure, camera, settings, buttons):
                                                         "wspace": 0.06, "hspace": 0.17})
     images = {name: show_image(axes[name], np.full((height, width), np.nan), "", vmin=0, vmax=3,  # cm
                                extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-                               cmap=colormaps["cividis"].with_extremes(bad=BLANK)) for name in axes if name != "above"}
+                               cmap=colormaps[DISTANCES].with_extremes(bad=BLANK)) for name in axes if name != "above"}
     for name, title in TITLES.items():
         axes[name].set_title(title.format(width, height), fontsize=9.5)
     draw_wheel(axes["flow"], SHOWN / camera.pixel_size, low=True)
@@ -332,8 +339,9 @@ def explorer_panels(figure, camera, settings, buttons):
                                                                        "edgecolor": "0.5"})
                  for i, (key, text) in enumerate(buttons.items())})
     above.legend(loc="upper left", bbox_to_anchor=(0, -0.14), fontsize=8.5, frameon=False)
-    art.live = [*images.values(), *axes["flow"].child_axes, *axes["flow"].texts, art.true, art.predicted, art.others,
-                art.elites, *art.arrows, art.ways, art.rings, art.stars, art.text]
+    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), *axes["flow"].child_axes,
+                *axes["flow"].texts, art.predicted, art.others, art.elites, *art.arrows, art.ways, art.rings, art.stars,
+                art.text]
     for artist in art.live:
         artist.set_animated(True)
     return art
