@@ -100,6 +100,19 @@ def test_a_run_for_cameras_trains_under_faults_and_says_so(small, tmp_path, caps
              "--depth-noise", "--camera-faults")
 
 
+def test_a_run_that_starts_from_another_one_has_its_parameters_and_nothing_else_of_it(small, tmp_path, capsys):
+    first, data = small / "checkpoint.npz", load_interactions(small / "train")
+    options = ["--steps", 3, "--batch", 2, "--jobs", 1, "--seed", 4, "--start-from", first]
+    assert run("train", small / "train", tmp_path / "a.npz", *options) == 0
+    again = training.start_run(training.Recipe(steps=3, batch=2, seed=4, sizes=Sizes(width=8)), data)
+    again.vector = vector(first)
+    np.testing.assert_array_equal(vector(tmp_path / "a.npz"), training.train(data, again).vector)
+    found = checkpoints.load_run(tmp_path / "a.npz").meta
+    assert found["started_from"] == checkpoints.load_run(first).meta["data"] and found["log"][-1]["step"] == 3
+    one_line(capsys, run("train", small / "train", tmp_path / "b.npz", *options, "--width", 9), "--start-from", "width")
+    one_line(capsys, run("train", small / "train", tmp_path / "b.npz", *TINY, "--start-from", "none.npz"), "none.npz")
+
+
 # --- evaluate and show ----------------------------------------------------------------------------
 
 def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp_path, capsys):

@@ -137,15 +137,23 @@ def run_export(args):
     print(f"{args.folder}: {count} pokes; 'hind4sight import' takes them back")
 
 
-def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, camera_faults=False,
+def new_run(interactions, weight=(), masks=None, width=None, depth_noise=0.0, camera_faults=False, start_from=None,
             **given):
-    """A fresh Run as the options of `train` say."""
+    """A fresh Run as the options of `train` say; with start_from, a path, from the parameters of that checkpoint."""
     if depth_noise and camera_faults:
         raise ValueError("--depth-noise: --camera-faults has a noise of its own")
-    recipe = training.Recipe(**given, sizes=Sizes(masks=masks, width=width),
-                             weights={**training.WEIGHTS, **dict(weight)})
-    run = training.start_run(recipe, interactions)
+    start = start_from and checkpoints.load_run(start_from)
+    sizes = start.recipe.sizes if start else Sizes()
+    asked = replace(sizes, masks=masks or sizes.masks, width=width or sizes.width)
+    if start and asked != sizes:
+        raise ValueError(f"--start-from: {start_from} has {sizes.masks} masks and a width of {sizes.width}, expected "
+                         f"{asked.masks} and {asked.width}")
+    run = training.start_run(training.Recipe(**given, sizes=asked, weights={**training.WEIGHTS, **dict(weight)}),
+                             interactions)
     run.meta.update(depth_noise=depth_noise, camera_faults=camera_faults)
+    if start:
+        run.vector = start.vector
+        run.meta["started_from"] = start.meta.get("data")  # the data set its parameters were trained on
     return run
 
 
@@ -439,6 +447,8 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--depth-noise": {"type": float, "help": "SD in m of the noise to train under (0)"},
         "--camera-faults": {"action": "store_true", "default": None, "help": "train for real cameras: under noise, "
                             "missing depth and an uncertain pose"},
+        "--start-from": {"type": checkpoint_path, "metavar": "FILE",
+                         "help": "a checkpoint to begin with its parameters, not with random ones"},
         "--resume": {"action": "store_true", "help": "go on with the checkpoint OUT and its recipe"},
         "--jobs": JOBS, "--json": JSON}),
     "evaluate": (run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped ones", {
