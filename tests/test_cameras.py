@@ -103,6 +103,8 @@ def test_a_small_pixel_shows_what_opencv_projects_to_it(size, tmp_path):
     away = colours[:, :2] - pixels[inside]
     assert np.abs(away).max() < 1.6, "distortion the wrong way round? half a pixel lost?"
     assert np.abs(away.mean(axis=0)).max() < 0.15
+    middle = data.rgb_before[0][size[1] // 2, size[0] // 2].astype(float) * [2, 1, 1]
+    assert np.abs(middle[:2] - [160, 120]).max() < 8, "not the recorded picture's middle"
     heights, off = points[seen][:, 2], 0.001 + data.camera.pixel_size / 4  # at a rim a part of the block
     assert (np.minimum(np.abs(heights), np.abs(heights - 0.06)) < off).all(), "a mean of the object and the table?"
     assert (heights > 0.05).mean() > 0.02
@@ -168,7 +170,7 @@ def test_holes_in_the_empty_picture_are_filled_where_the_table_surrounds_them():
     seen = empty.copy()
     seen[10:16, 20:30] = seen[30, 5] = seen[47, 60:] = 0  # on the table, the last at the picture's rim
     seen[20:30, 40:50] -= 0.05  # something stands there, with a hole in its middle
-    seen[24:26, 44:46] = 0
+    seen[24:26, 44:46] = seen[21:24, 38:42] = 0  # and one half on the table
     expected = seen.copy()
     for hole in (slice(10, 16), slice(20, 30)), (30, 5), (47, slice(60, None)):
         expected[hole] = empty[hole]
@@ -285,6 +287,7 @@ DEPTH = np.full((HEIGHT, WIDTH), 800, np.uint16)
     (entry(depth_unit=-0.001), "depth_unit: expected .*above 0, got -0.001"),
     (entry(camera_matrix=[330, 340, 155, 128]), "camera_matrix: expected .*\\(3, 3\\)"),
     (entry(camera_matrix=MATRIX.T.tolist()), "camera_matrix: expected .*fx, 0, cx"),
+    (entry(camera_matrix=(MATRIX * [0, 1, 1]).tolist()), "camera_matrix: expected .*fx, 0, cx"),
     (entry(distortion=[0.1, 0.2]), "distortion: expected .*\\(4,\\)"), (entry(distortion=[1e400] * 4), "distortion: "),
     (entry(origin=[3, 4]), "origin: expected none beside"), (entry(settings=[1]), "settings: expected"),
     (entry(settings={"arena": "big"}), "settings: arena: expected"),
@@ -305,7 +308,7 @@ DEPTH = np.full((HEIGHT, WIDTH), 800, np.uint16)
     (text("pokes.csv", ", 0, ", ", x, "), "pokes.csv: line 2: expected a name and five numbers"),
     (text("pokes.csv", ", 0, ", ", nan, "), "expected its direction"),
     (text("pokes.csv", ", 0, ", ", 30, "), "0.000 rad, got 30"),
-    (text("pokes.csv", "\n0, ", "\n1, 300, 0, 0, 200, 0\n0, "), "poke 1: expected a start and a target in the arena"),
+    (text("pokes.csv", "\n0, ", "\n1, 300, 0, 0, 1e300, 0\n0, "), "poke 1: expected a start and a target in the arena"),
     (text("pokes.csv", "\n0,", "\n../0,"), "line 2: expected a name of its own"),
     (text("pokes.csv", "\n", "\n0, 0, 0, 0, -0.1, 0\n0, 0, 0, 0, -0.1, 0\n"), "line 3: expected a name of its own")])
 def test_a_recording_that_cannot_be_is_refused_by_its_file_and_field(spoil, said, tmp_path, capfd):

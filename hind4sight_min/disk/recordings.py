@@ -70,9 +70,9 @@ class Recording:
                 object.__setattr__(self, name, _numbers(name, value, *shapes))
         if not self.depth_unit > 0:
             raise ValueError(f"depth_unit: expected m per count, above 0, got {self.depth_unit}")
-        if np.any(self.camera_matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != [0, 0, 0, 0, 1]):
-            raise ValueError("camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got "
-                             f"{self.camera_matrix.tolist()}")
+        (fx, skew, _), (below, fy, _), last = matrix = self.camera_matrix
+        if skew or below or last.tolist() != [0, 0, 1] or not min(fx, fy) > 0:
+            raise ValueError(f"camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {matrix.tolist()}")
         if self.origin is not None and self.arena_from_camera is not None:
             raise ValueError("origin: expected none beside arena_from_camera, which says where it is")
         for name, poke, start in zip(self.names, self.pokes, self.starts):
@@ -133,7 +133,8 @@ def _rows(text):
             raise ValueError(f"line {reader.line_num}: expected a name and five numbers") from None
     if not found:
         raise ValueError("expected a poke at least")
-    return list(found), np.array(list(found.values()), np.float32)
+    with np.errstate(over="ignore"):  # to infinity, which is in no arena
+        return list(found), np.array(list(found.values()), np.float32)
 
 
 def load_recording(folder):

@@ -77,25 +77,24 @@ def shards_in(folder):
     return shards
 
 
-def each_shard(folder):
-    """The shards of a folder, one after the other -> Interactions. Raises ValueError unless they are of one data set:
-    of the same camera and empty arena, and collected with the same seed and settings.
+def parts_of(folder):
+    """The shards of a folder, in order, one after the other -> Interactions. Raises ValueError unless they are of one
+    data set: of the same camera and empty arena, and collected with the same seed and settings.
     """
     first = None
     for path in shards_in(folder):
         part = load_shard(path)
-        meta, empty_depth = first = first or (part.meta, part.empty_depth)
+        first = first or part
         for name in ("camera", "settings", "seed"):
-            if part.meta.get(name) != meta.get(name):
+            if part.meta.get(name) != first.meta.get(name):
                 raise ValueError(f"{path}: of another data set than the folder's first shard: its {name} differs")
-        if not np.array_equal(part.empty_depth, empty_depth):
+        if not np.array_equal(part.empty_depth, first.empty_depth):
             raise ValueError(f"{path}: of another data set than the folder's first shard: its empty arena differs")
         yield part
 
 
 def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions; see `each_shard`."""
-    parts = list(each_shard(folder))
-    first = parts[0]
+    """All shards of a folder, joined -> Interactions. Raises ValueError as `parts_of`."""
+    parts = [*parts_of(folder)]
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POKE}
-    return Interactions(**joined, empty_depth=first.empty_depth, camera=first.camera, meta=first.meta)
+    return Interactions(**joined, empty_depth=parts[0].empty_depth, camera=parts[0].camera, meta=parts[0].meta)

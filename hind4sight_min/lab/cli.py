@@ -15,7 +15,7 @@ from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.recordings import save_recording
-from ..disk.shards import each_shard, load_interactions
+from ..disk.shards import load_interactions, parts_of
 from ..networks import Sizes
 from ..sim.arena import MIDDLE, Settings
 from ..sim.bodies import read_urdfs
@@ -133,7 +133,7 @@ def run_import(args):
 
 def run_export(args):
     with only_one(args.folder):
-        count = save_recording(args.folder, each_shard(args.data))
+        count = save_recording(args.folder, parts_of(args.data))
     print(f"{args.folder}: {count} pokes; 'hind4sight import' takes them back")
 
 
