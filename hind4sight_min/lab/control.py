@@ -237,12 +237,9 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
-def harder(search, far):
-    """The planning.Search for where a first one saw no gain: more candidates, and far from the goal two pokes ahead.
-
-    Of two objects that must swap one must make room first.
-    """
-    return replace(search, candidates=min(4 * search.candidates, 10_000), horizon=2 if far else search.horizon)
+def two_ahead(search):
+    """A planning.Search for two pokes in a row, twice the candidates: of two objects that swap one must make room."""
+    return replace(search, horizon=2, candidates=min(2 * search.candidates, 10_000))
 
 
 def next_plan(policy, task, view, labels, goal, run, search, rng):
@@ -304,8 +301,8 @@ def distances(poses, task):
 def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. Where a
-    plan sees no gain, a `harder` search is made before it stops.
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. Where one
+    poke ahead sees no gain far from the goal, it looks two ahead before it stops.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke
@@ -322,9 +319,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     while len(pokes) < budget:
         try:
             found = next_plan(policy, task, view, labels, goal, run, search, rng)
-            if found.cost > found.now - GAIN:
-                again = harder(search, found.now > NEAR)
-                found = next_plan(policy, task, view, labels, goal, run, again, rng)
+            if found.cost > found.now - GAIN and found.now > NEAR and search.horizon == 1:
+                found = next_plan(policy, task, view, labels, goal, run, two_ahead(search), rng)
         except NoPoke as none:
             if not pokes:
                 raise
