@@ -324,7 +324,7 @@ def control_table():
         avoided, shift = (figures[f"{planner}_obstacle_{name}"] for name in ("avoided", "shift_cm"))
         obstacle.append(f"{avoided:.0%} of the runs, and moves it by {shift:.1f} cm on average")
     return (tables.planning_table(figures) + "\n\nIn three scenes, five times each, another object stands across "
-            f"half of the way. Planning two pokes ahead avoids it (moves it by less than 1 cm) in {obstacle[0]}; "
+            f"half of the way. Planning avoids it (moves it by less than 1 cm) in {obstacle[0]}; "
             f"pushing straight at the goal does in {obstacle[1]}.")
 
 

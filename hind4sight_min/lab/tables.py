@@ -327,8 +327,6 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
     """
     _, policy, changes = PLANNERS.get(planner, ("", planner, {}))
     run, search = checkpoints.load_run(checkpoint), planning.Search(**changes)
-    if not movers:
-        search = control.two_ahead(search)  # getting around an obstacle takes more than one poke
 
     def compute():
         with control.random_task(seed, max(movers, 1), movers == 0, control.settings_for(run)) as task:
