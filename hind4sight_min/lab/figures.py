@@ -160,9 +160,8 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
 
 
-def draw_wheel(axes, scale, low):
-    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px. Not in the paper.
-    """
+def _draw_wheel(axes, scale, low):
+    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px."""
     y = 0.02 if low else 0.68
     wheel = axes.inset_axes((0.02, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))
@@ -246,7 +245,7 @@ def interaction_figure(interactions, row, answer, truth=None):
         show_image(panels[label], picture, title)
     arrow = on_table([start, poke[:2]], camera)
     draw_arrow(panels["before"], *arrow)
-    draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
+    _draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
     _draw_losses(panels, answer)
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      settings["arena"])
@@ -313,20 +312,25 @@ def explorer_panels(figure, camera, settings, buttons):
                                cmap=colormaps[DISTANCES].with_extremes(bad=BLANK)) for name in axes if name != "above"}
     for name, title in TITLES.items():
         axes[name].set_title(title.format(width, height), fontsize=9.5)
-    draw_wheel(axes["flow"], SHOWN / camera.pixel_size, low=True)
+        axes[name].spines[:].set_visible(name == "above")
     bar = axes["distance"].inset_axes((0.1, -0.09, 0.6, 0.05))
     figure.colorbar(images["distance"], cax=bar, orientation="horizontal").set_label("cm", loc="right")
     above, view = axes["above"], axes["camera"]
     above.set(aspect="equal", anchor="N", xlim=(-half, half), ylim=(-half, half), **ARENA)
     above.yaxis.tick_right()
     above.yaxis.set_label_position("right")
+    wheel = above.inset_axes((0.76, -0.38, 0.22, 0.22))
+    wheel.imshow(colour_wheel(96))
+    wheel.axis("off")
+    above.text(0.74, -0.35, f"optical flow, rim: {SHOWN / camera.pixel_size:.0f} px", fontsize=8.5, ha="right",
+               transform=above.transAxes)
 
     def lines(axes, colour, width, label=None):
         axes.plot([], [], color=colour, label=label)
         return axes.add_collection(LineCollection([], colors=[colour], linewidths=width))
     art = SimpleNamespace(
         axes=axes, images=images, points=above.scatter([], [], s=9, linewidths=0),
-        true=lines(above, TRUE, 2.6, "what really happened, after poke!"),
+        true=lines(above, TRUE, 2.6, "true, after poke!"),
         predicted=lines(above, PREDICTED, 1.1, "predicted"),
         others=lines(view, "white", 0.8), elites=lines(view, GOAL, 1.6),
         arrows=[draw_arrow(each, (0, 0), (1, 1)) for each in (view, axes["seen"], above)],
@@ -339,9 +343,8 @@ def explorer_panels(figure, camera, settings, buttons):
                                                                        "edgecolor": "0.5"})
                  for i, (key, text) in enumerate(buttons.items())})
     above.legend(loc="upper left", bbox_to_anchor=(0, -0.14), fontsize=8.5, frameon=False)
-    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), *axes["flow"].child_axes,
-                *axes["flow"].texts, art.predicted, art.others, art.elites, *art.arrows, art.ways, art.rings, art.stars,
-                art.text]
+    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), art.predicted, art.others, art.elites,
+                *art.arrows, art.ways, art.rings, art.stars, art.text]
     for artist in art.live:
         artist.set_animated(True)
     return art
@@ -386,12 +389,16 @@ def save_sequence(path, record, camera):
 def save_film(path, frames, seconds):
     """Write pictures (H, W, 3) uint8 as a GIF that goes on for ever, whole or not at all. Not in the paper.
 
-    One palette for all. seconds: how long each is shown. Raises ValueError for a path that does not end in .gif.
+    One palette for all: what is frequent, and what is rare but of its own colour. seconds: how long each is shown.
+    Raises ValueError for a path that does not end in .gif.
     """
     from PIL import Image
     check_output("path", path, ".gif")
-    some = np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2]
-    palette = Image.fromarray(some).quantize(192)
+    some = Image.fromarray(np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2])
+    frequent, rare = (some.quantize(count, method).getpalette() for count, method in (
+        (192, Image.Quantize.MEDIANCUT), (64, Image.Quantize.MAXCOVERAGE)))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(frequent[:3 * 192] + rare[:3 * 64])
     first, *others = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     with whole_file(path) as temporary:
         first.save(temporary, save_all=True, append_images=others, duration=round(1000 * seconds), loop=0)

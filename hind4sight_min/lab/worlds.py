@@ -23,7 +23,20 @@ class Simulated:
     """
     suggested = None
     demo = """
+        drag 43 21 50 24 50 18 43 14 37 15 34 19
         wait 1
+        key space
+        wait 3
+        goal 20 15 30 22
+        wait 1
+        key p
+        wait 1
+        key space
+        wait 2
+        key p
+        wait 1
+        key space
+        wait 3
     """
 
     def __init__(self, settings, seed):
@@ -33,7 +46,12 @@ class Simulated:
 
     def next(self):
         self.arena.new_scene()
-        self.seen, self.history = (*self.arena.observe(), self.arena.photograph()), []
+        self.history = []
+        self._see()
+
+    def _see(self):
+        rgb, depth, labels = self.arena.observe()
+        self.seen = rgb, depth, labels, rgb
 
     def look(self):
         rgb, depth, _, photograph = self.seen
@@ -45,7 +63,7 @@ class Simulated:
         if np.isnan(start).any():
             raise NoPoke("There is no room for the finger to come down: turn the arrow.")
         self.history.append((state, self.seen))
-        self.seen = *self.arena.observe(), self.arena.photograph()
+        self._see()
         return poke, start, true_scene_flow(view.cloud[:len(labels)], labels, before, self.arena.poses())
 
     def undo(self):
