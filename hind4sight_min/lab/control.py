@@ -285,3 +285,12 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     record = dict(zip(("rgb", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
     return {**record, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
             "movers": task.movers, "goal_marks": task.goal_marks, **({"goal_rgb": task.goal[0]} if task.goal else {})}
+
+
+def photographed(record, task, width=384):
+    """The record of a closed loop with "photographs" of its states and, where it has a goal, a "goal_photograph".
+
+    Not in the paper. The task's arena still holds its objects; width: of a photograph, px.
+    """
+    goal = {"goal_photograph": task.arena.photograph(task.goal_poses, width)} if task.goal else {}
+    return {**record, **goal, "photographs": [task.arena.photograph(poses, width) for poses in record["poses"]]}

@@ -7,6 +7,7 @@ import numpy as np
 from ..disk.shards import load_interactions
 from ..planning import NoPoke
 from ..sim.arena import Arena, Settings
+from ..sim.photographs import photographs
 from ..sim.truth import find_truth, true_scene_flow
 from .cli import data_small
 from .control import carry_out, settings_for
@@ -50,8 +51,7 @@ class Simulated:
         self._see()
 
     def _see(self):
-        rgb, depth, labels = self.arena.observe()
-        self.seen = rgb, depth, labels, rgb
+        self.seen = *self.arena.observe(), self.arena.photograph()
 
     def look(self):
         rgb, depth, _, photograph = self.seen
@@ -83,6 +83,7 @@ class Recorded:
         self.interactions, self.truth, self.camera = interactions, truth, interactions.camera
         self.empty_depth, self.settings = interactions.empty_depth, {**asdict(Settings()), **interactions.settings}
         self.scenes = np.arange(len(interactions)) if truth is None else scenes_of_pokes(truth)
+        self.photographs = photographs(interactions, None, range(len(interactions)))  # shipped ones: few
         self.scene = seed - 1
         self.next()
 
@@ -94,7 +95,7 @@ class Recorded:
         data = self.interactions
         row, when = (self.rows[0], "before") if self.rows else (self.history[-1], "after")
         rgb, depth = (getattr(data, f"{name}_{when}")[row] for name in ("rgb", "depth"))
-        return rgb, depth, rgb
+        return rgb, depth, dict(zip(("before", "after"), self.photographs.get(row, ()))).get(when, rgb)
 
     @property
     def suggested(self):
