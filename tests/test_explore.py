@@ -196,8 +196,8 @@ def test_a_script_saves_pictures_and_is_filmed(tmp_path, capsys, monkeypatch):
     (tmp_path / "script").write_text("drag 30 20 34 16  # a poke\nkey space\n\nwait 0.5\nkey s\n")
     assert main(["explore", str(FOLDER), "--script", "script", "--demo", "out.gif"]) == 0
     with Image.open("explore_1.png") as picture, Image.open("out.gif") as film:
-        assert picture.size == (1300, 780) == film.size and film.n_frames > 3
-    assert capsys.readouterr().out == "out.gif: 2 s\n"
+        assert picture.size == (975, 585) == film.size and film.n_frames > 3
+    assert capsys.readouterr().out == "out.gif: 3 s\n"
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +205,7 @@ def blank():
     return opened()
 
 
-@pytest.mark.parametrize("line", ["drag 1 2 3", "drag 1 2 3 x", "fly 1 2 3 4", "key", "key x", "wait", "wait long"])
+@pytest.mark.parametrize("line", ["drag 1 2 3", "drag 1 2", "drag 1 2 3 x", "fly 1 2 3 4", "key", "key x", "wait", "wait long"])
 def test_a_script_that_says_something_else_is_refused_in_one_line(line, blank):
     with pytest.raises(ValueError, match="^script, line 2: expected drag or goal X Y X Y, key K, or wait SEC.*'$"):
         explore.play(blank, ["wait 0", line])

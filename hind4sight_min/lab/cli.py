@@ -21,6 +21,7 @@ from ..sim.arena import MIDDLE, Settings
 from ..sim.bodies import read_urdfs
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
+from ..sim.photographs import photographs
 from ..sim.truth import find_truth
 from . import cameras, contact, control, evaluation, tables
 from .camera_faults import ONE_SIDED, under_faults
@@ -218,24 +219,28 @@ def run_evaluate(args):
     write_json(args.json, metrics)
 
 
+def well_moved(interactions, truth):
+    """The row of a poke that moved something well, not the best one; by depth where the truth is None."""
+    if truth is None:
+        motion = [np.abs(after - before)[(before > 0) & (after > 0)].sum()
+                  for before, after in zip(interactions.depth_before, interactions.depth_after)]
+    else:
+        motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
+    return int(np.argsort(motion)[int(0.7 * len(motion))])
+
+
 def run_show(args):
     from . import figures
     folder_alone(args)
     check_output("--out", args.out, ".png")
     run = checkpoints.load_run(args.checkpoint)
     interactions, truth = load_interactions(args.data), find_truth(args.data)
-    row = args.row
-    if row is None:  # a poke that moved something well, not the best one
-        if truth is None:
-            motion = [np.abs(after - before)[(before > 0) & (after > 0)].sum()
-                      for before, after in zip(interactions.depth_before, interactions.depth_after)]
-        else:
-            motion = np.linalg.norm((truth.poses_after - truth.poses_before)[..., :3], axis=2).max(axis=1)
-        row = int(np.argsort(motion)[int(0.7 * len(motion))])
+    row = well_moved(interactions, truth) if args.row is None else args.row
     if not 0 <= row < len(interactions):
         raise ValueError(f"row: expected 0 to {len(interactions) - 1}, got {row}")
     answer = evaluation.ask(run, interactions, row)
-    figures.save_figure(figures.interaction_figure(interactions, row, answer, truth), args.out)
+    seen = photographs(interactions, truth, [row]).get(row)
+    figures.save_figure(figures.interaction_figure(interactions, row, answer, truth, seen), args.out)
     print(f"{args.out}: interaction {row}")
 
 
@@ -281,7 +286,7 @@ def run_plan(args):
     with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
-        record = control.closed_loop(task, run, args.policy, search, args.budget, args.seed)
+        record = control.photographed(control.closed_loop(task, run, args.policy, search, args.budget, args.seed), task)
     distance = record["distance"].mean(axis=1)  # m
     for t, (poke, start) in enumerate(zip(record["pokes"], record["starts"])):
         done = "" if np.isfinite(start).all() else "  (no room for the finger: not carried out)"

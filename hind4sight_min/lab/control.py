@@ -306,8 +306,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     poke ahead sees no gain far from the goal, it looks two ahead before it stops.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
-    room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke
-    where not even the first poke is possible; later on that ends the loop, as an empty arena does.
+    room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
+    arena, and NoPoke where not even the first poke is possible; later on that ends the loop, as an empty arena does.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
@@ -346,3 +346,12 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     return {**record, "stopped": stopped, "pokes": np.float32(pokes).reshape(-1, 3),
             "starts": np.float32(starts).reshape(-1, 2), "movers": task.movers, "goal_marks": task.goal_marks,
             **({"goal_rgb": task.goal[0]} if task.goal else {})}
+
+
+def photographed(record, task, width=384):
+    """The record of a closed loop with "photographs" of its states and, where it has a goal, a "goal_photograph".
+
+    Not in the paper. The task's arena still holds its objects; width: of a photograph, px.
+    """
+    goal = {"goal_photograph": task.arena.photograph(task.goal_poses, width)} if task.goal else {}
+    return {**record, **goal, "photographs": [task.arena.photograph(poses, width) for poses in record["poses"]]}

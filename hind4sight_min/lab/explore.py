@@ -30,8 +30,8 @@ from .marks import at_height, follow, places_at, points_at
 from .worlds import world_of
 
 
-KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goal marks  [g]", "p": "plan  [p]",
-        "s": "save picture  [s]"}
+KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goals  [g]", "p": "plan  [p]",
+        "s": "save  [s]"}
 SIZE = 13.0, 7.8  # inches
 SAME = 0.03  # m; a mark takes the place of one so near
 
@@ -75,10 +75,9 @@ class Explorer:
         self.canvas.restore_region(self.background)
         for artist in self.art.live:
             self.figure.draw_artist(artist)
-        if not blit:
-            return
-        self.canvas.blit(self.figure.bbox)
-        if self.frames is not None:
+        if blit:
+            self.canvas.blit(self.figure.bbox)
+        if blit and self.frames is not None:
             self.frames.append(np.array(self.canvas.buffer_rgba())[..., :3])
 
     def look(self):
@@ -216,6 +215,7 @@ class Explorer:
     def carry_out(self):
         """Poke, and show what is true beside what was predicted."""
         scene, view, goals = self.scene, self.view, self.goals
+        asked = self.poke
         self.poke, start, true = self.world.poke(view, self.poke)
         self.ask()
         self.look()
@@ -238,7 +238,7 @@ class Explorer:
             left = at_height(goals, self.view.marks[:, 2], self.camera) - self.view.marks[:, :2]
             said = f"{100 * np.linalg.norm(left, axis=1).mean():.1f} cm to go. {said}"
         self.draw_poke(start)
-        self.say(said)
+        self.say(said if asked is self.poke else f"The recorded poke, without a simulator. {said}")
         self.canvas.draw()
 
     def plan(self):
@@ -267,8 +267,9 @@ class Explorer:
     def save(self):
         """Save the figure as a picture."""
         self.saved += 1
-        figures.save_figure(self.figure, self.out / f"explore_{self.saved}.png")
-        self.say(f"Saved as {self.out / f'explore_{self.saved}.png'}")
+        path = self.out / f"explore_{self.saved}.png"
+        figures.save_figure(self.figure, path)
+        self.say(f"Saved as {path}")
 
 
 def direction(pokes):
@@ -281,31 +282,35 @@ def direction(pokes):
 def play(explorer, lines):
     """Do what the lines of a script say, by the events that mouse and keys make.
 
-    drag X Y X Y: press, move, let go, in pixels of the model's picture; goal X Y X Y: with the right button; key K;
-    wait SECONDS, in a film. Raises ValueError naming a line that says something else.
+    drag X Y X Y ...: press, move on to these pixels of the model's picture, let go; goal X Y X Y ...: the same with the
+    right button; key K; wait SECONDS, in a film. Raises ValueError naming a line that says something else.
     """
     canvas, camera = explorer.canvas, explorer.art.axes["camera"].transData
     for number, line in enumerate(lines, 1):
         word, *rest = line.split("#")[0].split() or ["wait", 0]
+        events, times = [], 1  # that a film shows each picture
         try:
-            events = []
             if word == "key":
                 key, = [key for key in KEYS if rest == [key.replace(" ", "space")]]
-                events = [KeyEvent("key_press_event", canvas, key)]
+                events, times = [KeyEvent("key_press_event", canvas, key)], 8
             elif word == "wait":
                 seconds, = map(float, rest)
                 if explorer.frames:
                     explorer.frames += explorer.frames[-1:] * round(10 * seconds)
             else:
-                x, y, to_x, to_y = map(float, rest)
-                names = ["button_press_event", *7 * ["motion_notify_event"], "button_release_event"]
+                corners = np.reshape([float(each) for each in rest], (-1, 2))
+                way = np.linspace(corners[:-1], corners[1:], 8, endpoint=False).swapaxes(0, 1).reshape(-1, 2)
+                names = ["button_press_event", *(len(way) - 1) * ["motion_notify_event"], "button_release_event"]
                 events = [MouseEvent(name, canvas, *camera.transform(place), {"drag": 1, "goal": 3}[word])
-                          for name, place in zip(names, np.linspace((x, y), (to_x, to_y), len(names)))]
+                          for name, place in zip(names, [*way, corners[-1]], strict=True)]
         except (KeyError, ValueError):
             raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, "
                              f"got {line.strip()!r}") from None
+        filmed = len(explorer.frames or ())
         for event in events:
             canvas.callbacks.process(event.name, event)
+        if explorer.frames:
+            explorer.frames[filmed:] = [frame for frame in explorer.frames[filmed:] for _ in range(times)]
 
 
 def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
@@ -335,9 +340,8 @@ def run_explore(args):
         explorer = explore(*given)
         plt.show()
         return explorer
-    if args.demo:
-        check_output("--demo", args.demo, ".gif")
-    explorer = explore(*given, FigureCanvasAgg(Figure(SIZE, dpi=100)).figure)
+    check_output("--demo", args.demo or "none.gif", ".gif")
+    explorer = explore(*given, FigureCanvasAgg(Figure(SIZE, dpi=75)).figure)
     explorer.frames = [] if args.demo else None
     play(explorer, (Path(args.script).read_text() if args.script else explorer.world.demo).splitlines())
     if args.demo:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.patches import FancyArrowPatch, Rectangle
 from matplotlib.patheffects import Normal, withStroke
 
 from ..disk.files import check_output, whole_file
@@ -71,6 +71,20 @@ def show_image(axes, picture, title, **how):
     axes.set_title(title, fontsize=11)
     axes.set(xticks=[], yticks=[])
     return axes.imshow(picture, interpolation="nearest", **how)
+
+
+def show_flow(axes, flow, scale, title):
+    """Optical flow (H, W, 2) px as an image panel. Not in the paper. scale: as for `flow_to_rgb`.
+
+    At every third pixel each way an arrow, true to length, says the same to those who cannot tell the colours.
+    """
+    shown = show_image(axes, flow_to_rgb(flow, scale), title)
+    some = np.zeros(flow.shape[:2], bool)
+    some[1::3, 1::3] = np.linalg.norm(flow[1::3, 1::3], axis=-1) > 0.1 * scale
+    if some.any():
+        rows, columns = np.nonzero(some)
+        axes.quiver(columns, rows, *flow[some].T, angles="xy", scale_units="xy", scale=1, width=0.006, color="black")
+    return shown
 
 
 def draw_arrow(axes, start, target):
@@ -142,6 +156,7 @@ VIEW_RATIO = 1.6  # width to height of the scene flow panel
 def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     """Arrows, true to length, over the points in their image colours; the view holds all arrows and the poke."""
     axes.scatter(*points[:, :2].T, c=0.45 + 0.55 * image, s=14, linewidths=0)
+    axes.plot([], [], "o", color="0.75", markersize=4, label="points seen,\nin their colours")
     inside = [start, target]
     for flow, colour, width, label in flows:
         moved = np.linalg.norm(flow, axis=1) > MOVING
@@ -156,7 +171,7 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     centre, half = (inside.max(axis=0) + inside.min(axis=0)) / 2, np.ptp(inside, axis=0) / 2 + 0.02
     half = max(half[1], half[0] / VIEW_RATIO) * np.array([VIEW_RATIO, 1])
     (left, bottom), (right, top) = centre - half, centre + half
-    axes.set(title="Scene flow from above (Eq. 1)", aspect="equal", xlim=(left, right), ylim=(bottom, top), **ARENA)
+    axes.set(title="Scene flow, from above (Eq. 1)", aspect="equal", xlim=(left, right), ylim=(bottom, top), **ARENA)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
 
 
@@ -188,7 +203,7 @@ def _draw_losses(panels, answer):
     valid, next_valid = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     warped, in_view = warp_backward(after.images, answer.flow[None])
     show_image(panels["warped"], np.clip(warped[0], 0, 1),
-               "$\\hat I_t$: $I_{t+1}$ warped back\nalong the flow, Sec. III-C")
+               "$\\hat I_t$: after, warped back along\nthe flow, should be before, Sec. III-C")
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
@@ -205,53 +220,90 @@ def _draw_losses(panels, answer):
 
 # --- one poke, one training run ------------------------------------------------------------------------------
 
-def interaction_figure(interactions, row, answer, truth=None):
-    """One poke: what was seen, what the model says of it, what the losses see of that, and what is true. -> Figure
+WHOLE = ["photo_before", "photo_after"]  # panels of the whole picture; the others show what its frame holds
+NEAR_POKE = ["before", "after", "masks", "labels", "flow", "true_flow", "warped", "error", "distance_predicted",
+             "distance_observed"]
 
-    Paper: the quantities of Fig. 3 and 4 (Eq. 1-3, Sec. III-C and III-E). answer: of `evaluation.ask` for this row;
-    truth: of the whole data set; without one its panels are left out. A mask's colour is its place in PALETTE, an
-    object's that of its number.
-    """
-    camera, settings, before, after = interactions.camera, interactions.settings, answer.before, answer.after
-    poke, start, image = interactions.pokes[row], interactions.starts[row], before.images[0]
-    points, valid, size = before.points[0], before.valid[0], image.shape[:2]
+
+def _interaction_panels(truth):
+    """An empty figure -> it, and {label: Axes}. truth: whether there are panels for it."""
+    figure = Figure(figsize=(13, 12.2), dpi=100, layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3.05, 1))
+    true_labels, true_flow = ("labels", "true_flow") if truth else (".", ".")  # a dot is an empty place
+    return figure, {**upper.subplot_mosaic([["photo_before", "before", "masks", "flow"],
+                                            ["photo_after", "after", true_labels, true_flow],
+                                            ["warped", "error", "distance_predicted", "distance_observed"]]),
+                    **lower.subplot_mosaic([["scene_flow", "start", "end"]], width_ratios=(1.7, 1, 1))}
+
+
+def _draw_pictures(panels, images, photographs, arrow):
+    """What the camera sees and what the model gets of it, before and after; the poke on what was before."""
+    height, width = images[0].shape[:2]
+    place = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5)}  # a photograph's axes too are the model's pixels
+    whole = images if photographs is None else photographs
+    for name, symbol, image, photograph in zip(("before", "after"), ("I_t", "I_{t+1}"), images, whole):
+        poke = " and the poke $u_t$" if name == "before" else ""
+        show_image(panels[f"photo_{name}"], photograph, f"{name.capitalize()}{poke}:\nwhat the camera sees", **place)
+        show_image(panels[name], image, f"What the model gets: ${symbol}$,\n{width} x {height} pixels (framed part)")
+    for name in ("photo_before", "before"):
+        draw_arrow(panels[name], *arrow)
+
+
+def _zoom(panels, target, size):
+    """Show half of the picture, around the poke's target (2,) px, and frame that part in the whole ones."""
+    size = np.array(size)
+    low = np.clip(target - size / 4, 0, size / 2) - 0.5
+    for name in set(NEAR_POKE) & set(panels):
+        panels[name].set(xlim=(low[0], low[0] + size[0] / 2), ylim=(low[1] + size[1] / 2, low[1]))
+    for name in WHOLE:
+        panels[name].add_patch(Rectangle(low, *(size / 2), fill=False, color="white", linewidth=1.5))
+
+
+def _draw_motion(panels, interactions, row, answer, truth):
+    """Masks, optical flow and scene flow, and beside them what is true, if that is known."""
+    poke, start, before = interactions.pokes[row], interactions.starts[row], answer.before
+    image, points, valid = before.images[0], before.points[0], before.valid[0]
+    show_image(panels["masks"], blend(image, answer.prediction.masks[0, :, 1:].reshape(*image.shape[:2], -1)),
+               "Predicted masks $m_t^k$ (Eq. 1):\na colour each, grey stays")
     flows = {"flow": answer.flow}
     arrows = [((answer.prediction.points[0] - points)[valid], PREDICTED, 0.013, "predicted")]
     if truth is not None:
         true, flows["true_flow"], moving = true_motion(interactions, truth, row)
+        arrows.insert(0, (true[valid], TRUE, 0.026, "true"))  # first and wider, so that both are seen where they agree
         labels = truth.labels[row]
         numbers = np.arange(1, 1 + max(1, labels.max()))
-        moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(size)])
-        arrows.insert(0, (true[valid], TRUE, 0.026, "true"))  # first and wider, so that both are seen where they agree
-    flows = {name: flow.reshape(*size, 2) * valid.reshape(*size, 1) for name, flow in flows.items()}
+        moved = (labels[..., None] == numbers) & np.isin(numbers, labels[moving.reshape(labels.shape)])
+        show_image(panels["labels"], blend(image, moved.astype(float)),
+                   "True objects that moved:\na colour each, grey stayed")
+    flows = {name: (flow.reshape(-1, 2) * valid[:, None]).reshape(*image.shape[:2], 2) for name, flow in flows.items()}
     scale = max(1.0, *(np.linalg.norm(flow, axis=-1).max() for flow in flows.values()))  # px
-
-    figure = Figure(figsize=(14, 8.5), dpi=100, layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.7, 1))
-    true_labels, true_flow = (".", ".") if truth is None else ("labels", "true_flow")  # a dot is an empty place
-    first = ["before", "masks", true_labels, "flow", true_flow]
-    panels = {**upper.subplot_mosaic([first, ["after", "warped", "error", "distance_predicted", "distance_observed"]]),
-              **lower.subplot_mosaic([["scene_flow", "start", "end"]], width_ratios=(1.7, 1, 1))}
-    figure.suptitle(f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0", fontsize=13)
-    pictures = [
-        ("before", "Before: image $I_t$\nand the poke $u_t$", image),
-        ("after", "After: image $I_{t+1}$", after.images[0]),
-        ("masks", "Predicted masks $m_t^k$ (Eq. 1)\na colour each",
-         blend(image, answer.prediction.masks[0, :, 1:].reshape(*size, -1))),
-        ("flow", "Predicted optical flow\n(U, V), Sec. III-C", flow_to_rgb(flows["flow"], scale))]
-    if truth is not None:
-        pictures += [("labels", "True objects that moved\n(colours of their own)", blend(image, moved.astype(float))),
-                     ("true_flow", "True optical flow\n(same colours)", flow_to_rgb(flows["true_flow"], scale))]
-    for label, title, picture in pictures:
-        show_image(panels[label], picture, title)
-    arrow = on_table([start, poke[:2]], camera)
-    draw_arrow(panels["before"], *arrow)
-    draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
-    _draw_losses(panels, answer)
+    for name, title in (("flow", "Predicted optical flow\n(U, V), Sec. III-C"), ("true_flow", "True optical flow\n")):
+        if name in flows:
+            show_flow(panels[name], flows[name], scale, title)
+    draw_wheel(panels["flow"], scale, low=poke[1] > 0)  # away from the target
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
-                     settings["arena"])
+                     interactions.settings["arena"])
+
+
+def interaction_figure(interactions, row, answer, truth=None, photographs=None):
+    """One poke: what was seen, what the model says of it, what the losses see of that, and what is true. -> Figure
+
+    Paper: the quantities of Fig. 3 and 4 (Eq. 1-3, Sec. III-C and III-E). answer: of `evaluation.ask` for this row;
+    truth: of the whole data set; without one its panels are left out. photographs: (before, after) of this row, of
+    `sim.photographs`, in the place of the model's small pictures. A mask's colour is its place in PALETTE, an object's
+    that of its number.
+    """
+    camera, poke, start = interactions.camera, interactions.pokes[row], interactions.starts[row]
+    figure, panels = _interaction_panels(truth is not None)
+    arrow = on_table([start, poke[:2]], camera)
+    _draw_pictures(panels, (answer.before.images[0], answer.after.images[0]), photographs, arrow)
+    _draw_motion(panels, interactions, row, answer, truth)
+    _draw_losses(panels, answer)
+    _zoom(panels, arrow[1], (camera.width, camera.height))
     for which, symbol, heatmap, place in zip(("start", "end"), "AB", answer.heatmaps, (start, poke[:2])):
-        _draw_heatmap(panels[which], heatmap.reshape(grid_shape(settings)), place, settings["arena"], which, symbol)
+        _draw_heatmap(panels[which], heatmap.reshape(grid_shape(interactions.settings)), place,
+                      interactions.settings["arena"], which, symbol)
+    figure.suptitle(f"Poke to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction {np.degrees(poke[2]):.0f}\u00b0", fontsize=13)
     return figure
 
 
@@ -313,20 +365,25 @@ def explorer_panels(figure, camera, settings, buttons):
                                cmap=colormaps[DISTANCES].with_extremes(bad=BLANK)) for name in axes if name != "above"}
     for name, title in TITLES.items():
         axes[name].set_title(title.format(width, height), fontsize=9.5)
-    draw_wheel(axes["flow"], SHOWN / camera.pixel_size, low=True)
+        axes[name].spines[:].set_visible(name == "above")
     bar = axes["distance"].inset_axes((0.1, -0.09, 0.6, 0.05))
     figure.colorbar(images["distance"], cax=bar, orientation="horizontal").set_label("cm", loc="right")
     above, view = axes["above"], axes["camera"]
     above.set(aspect="equal", anchor="N", xlim=(-half, half), ylim=(-half, half), **ARENA)
     above.yaxis.tick_right()
     above.yaxis.set_label_position("right")
+    wheel = above.inset_axes((0.76, -0.38, 0.22, 0.22))
+    wheel.imshow(colour_wheel(96))
+    wheel.axis("off")
+    above.text(0.74, -0.35, f"optical flow, rim: {SHOWN / camera.pixel_size:.0f} px", fontsize=8.5, ha="right",
+               transform=above.transAxes)
 
     def lines(axes, colour, width, label=None):
         axes.plot([], [], color=colour, label=label)
         return axes.add_collection(LineCollection([], colors=[colour], linewidths=width))
     art = SimpleNamespace(
         axes=axes, images=images, points=above.scatter([], [], s=9, linewidths=0),
-        true=lines(above, TRUE, 2.6, "what really happened, after poke!"),
+        true=lines(above, TRUE, 2.6, "true, after poke!"),
         predicted=lines(above, PREDICTED, 1.1, "predicted"),
         others=lines(view, "white", 0.8), elites=lines(view, GOAL, 1.6),
         arrows=[draw_arrow(each, (0, 0), (1, 1)) for each in (view, axes["seen"], above)],
@@ -339,9 +396,8 @@ def explorer_panels(figure, camera, settings, buttons):
                                                                        "edgecolor": "0.5"})
                  for i, (key, text) in enumerate(buttons.items())})
     above.legend(loc="upper left", bbox_to_anchor=(0, -0.14), fontsize=8.5, frameon=False)
-    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), *axes["flow"].child_axes,
-                *axes["flow"].texts, art.predicted, art.others, art.elites, *art.arrows, art.ways, art.rings, art.stars,
-                art.text]
+    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), art.predicted, art.others, art.elites,
+                *art.arrows, art.ways, art.rings, art.stars, art.text]
     for artist in art.live:
         artist.set_animated(True)
     return art
@@ -352,46 +408,58 @@ def explorer_panels(figure, camera, settings, buttons):
 def save_sequence(path, record, camera):
     """An animation of executed pokes: marked points as rings, where they shall be as stars, the next poke, the goal.
 
-    Paper: Sec. IV-G, its figure of a sequence. record: of `control.closed_loop`. path: its name ends in .gif; it is
-    written whole or not at all.
+    Paper: Sec. IV-G, its figure of a sequence. record: of `control.closed_loop`; with "photographs", of each state, and
+    "goal_photograph" these are shown, and beside them what the model gets. path: its name ends in .gif; it is written
+    whole or not at all.
     """
     from matplotlib.animation import PillowWriter
-    marks, goals, last = project(record["marks"], camera), record["goal_marks"], len(record["pokes"])
+    last, pictures = len(record["pokes"]), record.get("photographs", record["rgb"])
     distance = 100 * record["distance"].mean(axis=1)  # cm
-    arrows = on_table(np.stack([record["starts"], record["pokes"][:, :2]], axis=1), camera)
-    columns = 2 if "goal_rgb" in record else 1
-    figure = Figure(figsize=(4.2 * columns, 3.7), dpi=80)
-    figure.subplots_adjust(left=0.02, right=0.98, top=0.88, bottom=0.02, wspace=0.04)
-    writer = PillowWriter(fps=1)
+    beside = [(record["rgb"], f"what the model gets:\n{camera.width} x {camera.height} pixels")]
+    beside = beside if "photographs" in record else []
+    if "goal_rgb" in record:
+        beside.append(([record.get("goal_photograph", record["goal_rgb"])] * (last + 1), "the goal\n"))
+    figure = Figure(figsize=(4.2 * (1 + len(beside)), 3.7), dpi=80)
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.88, bottom=0.02, wspace=0.04)
+    writer, place = PillowWriter(fps=1), {"extent": (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)}
     with whole_file(path) as temporary, writer.saving(figure, str(temporary), dpi=80):
-        for t, image in enumerate(record["rgb"] / 255):
+        for t, picture in enumerate(pictures):
             figure.clear()
-            axes = figure.add_subplot(1, columns, 1)
+            panels = figure.subplots(1, 1 + len(beside), squeeze=False)[0]
             title = f"after {t} pokes: {distance[t]:.1f} cm to go"
-            show_image(axes, image, title if t == last else f"{title}\nnext: poke {t + 1}")
-            for mark, goal in zip(marks[t], goals):
-                axes.plot(*np.transpose([mark, goal]), ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)
-            axes.plot(*marks[t].T, "o", markersize=9, fillstyle="none", color=GOAL, markeredgewidth=2,
-                      path_effects=OUTLINE)
-            axes.plot(*goals.T, "*", markersize=11, color=GOAL, markeredgecolor="black")
-            if t < last and np.isfinite(arrows[t]).all():  # else the finger found no room
-                draw_arrow(axes, *arrows[t])
-            axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
-            if columns == 2:
-                show_image(figure.add_subplot(1, 2, 2), record["goal_rgb"] / 255, "goal\n")
+            show_image(panels[0], picture, title if t == last else f"{title}\nnext: poke {t + 1}", **place)
+            _draw_marks(panels[0], record, t, camera)
+            for axes, (others, name) in zip(panels[1:], beside):
+                show_image(axes, others[t], name, **place)
             for _ in range(2 if t == last else 1):
                 writer.grab_frame()
+
+
+def _draw_marks(axes, record, t, camera):
+    """Marked points and their goals after t pokes, and the next poke, if the finger found room for it."""
+    marks, goals = project(record["marks"][t], camera), record["goal_marks"]
+    for mark, goal in zip(marks, goals):
+        axes.plot(*np.transpose([mark, goal]), ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)
+    axes.plot(*marks.T, "o", markersize=9, fillstyle="none", color=GOAL, markeredgewidth=2, path_effects=OUTLINE)
+    axes.plot(*goals.T, "*", markersize=11, color=GOAL, markeredgecolor="black")
+    if t < len(record["pokes"]) and np.isfinite(record["starts"][t]).all():
+        draw_arrow(axes, *on_table([record["starts"][t], record["pokes"][t, :2]], camera))
+    axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
 
 
 def save_film(path, frames, seconds):
     """Write pictures (H, W, 3) uint8 as a GIF that goes on for ever, whole or not at all. Not in the paper.
 
-    One palette for all. seconds: how long each is shown. Raises ValueError for a path that does not end in .gif.
+    One palette for all: what is frequent, and what is rare but of its own colour. seconds: how long each is shown.
+    Raises ValueError for a path that does not end in .gif.
     """
     from PIL import Image
     check_output("path", path, ".gif")
-    some = np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2]
-    palette = Image.fromarray(some).quantize(192)
+    some = Image.fromarray(np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2])
+    frequent, rare = (some.quantize(count, method).getpalette() for count, method in (
+        (192, Image.Quantize.MEDIANCUT), (64, Image.Quantize.MAXCOVERAGE)))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(frequent[:3 * 192] + rare[:3 * 64])
     first, *others = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     with whole_file(path) as temporary:
         first.save(temporary, save_all=True, append_images=others, duration=round(1000 * seconds), loop=0)

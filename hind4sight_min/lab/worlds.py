@@ -7,6 +7,7 @@ import numpy as np
 from ..disk.shards import load_interactions
 from ..planning import NoPoke
 from ..sim.arena import Arena, Settings
+from ..sim.photographs import photographs
 from ..sim.truth import find_truth, true_scene_flow
 from .cli import data_small
 from .control import carry_out, settings_for
@@ -23,7 +24,20 @@ class Simulated:
     """
     suggested = None
     demo = """
+        drag 43 21 50 24 50 18 43 14 37 15 34 19
         wait 1
+        key space
+        wait 3
+        goal 20 15 30 22
+        wait 1
+        key p
+        wait 1
+        key space
+        wait 2
+        key p
+        wait 1
+        key space
+        wait 3
     """
 
     def __init__(self, settings, seed):
@@ -33,7 +47,11 @@ class Simulated:
 
     def next(self):
         self.arena.new_scene()
-        self.seen, self.history = (*self.arena.observe(), self.arena.photograph()), []
+        self.history = []
+        self._see()
+
+    def _see(self):
+        self.seen = *self.arena.observe(), self.arena.photograph()
 
     def look(self):
         rgb, depth, _, photograph = self.seen
@@ -45,7 +63,7 @@ class Simulated:
         if np.isnan(start).any():
             raise NoPoke("There is no room for the finger to come down: turn the arrow.")
         self.history.append((state, self.seen))
-        self.seen = *self.arena.observe(), self.arena.photograph()
+        self._see()
         return poke, start, true_scene_flow(view.cloud[:len(labels)], labels, before, self.arena.poses())
 
     def undo(self):
@@ -65,6 +83,7 @@ class Recorded:
         self.interactions, self.truth, self.camera = interactions, truth, interactions.camera
         self.empty_depth, self.settings = interactions.empty_depth, {**asdict(Settings()), **interactions.settings}
         self.scenes = np.arange(len(interactions)) if truth is None else scenes_of_pokes(truth)
+        self.photographs = photographs(interactions, None, range(len(interactions)))  # shipped ones: few
         self.scene = seed - 1
         self.next()
 
@@ -76,7 +95,7 @@ class Recorded:
         data = self.interactions
         row, when = (self.rows[0], "before") if self.rows else (self.history[-1], "after")
         rgb, depth = (getattr(data, f"{name}_{when}")[row] for name in ("rgb", "depth"))
-        return rgb, depth, rgb
+        return rgb, depth, dict(zip(("before", "after"), self.photographs.get(row, ()))).get(when, rgb)
 
     @property
     def suggested(self):

@@ -125,7 +125,7 @@ class Arena:
         self.bullet.disconnect()
 
     def _build(self):
-        p, s, c = self.bullet, self.settings, self.camera
+        p, s = self.bullet, self.settings
         p.setGravity(0, 0, -9.81)
         p.setPhysicsEngineParameter(fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1)
         half, thick, high, white = s.arena / 2, 0.01, s.wall_height / 2, [0.9, 0.9, 0.88, 1]
@@ -139,13 +139,7 @@ class Arena:
             p.changeDynamics(body, -1, lateralFriction=friction)
         self._finger = self._build_finger()
         self._place_finger(0, 0, PARK_HEIGHT)
-        # Bullet's renderer samples at a pixel's corner; this frustum puts the corners of the fine picture where the
-        # camera model wants the pixel centres.
-        fine, scale = SUPERSAMPLE, NEAR / (c.fx * SUPERSAMPLE)
-        x, y = fine * c.cx + (fine - 1) / 2, fine * c.cy + (fine - 1) / 2
-        self._projection = p.computeProjectionMatrix(-x * scale, (fine * c.width - x) * scale,
-                                                     -(fine * c.height - 1 - y) * scale, (1 + y) * scale, NEAR, FAR)
-        opengl_from_arena = np.diag([1.0, -1, -1, 1]) @ c.camera_from_arena
+        opengl_from_arena = np.diag([1.0, -1, -1, 1]) @ self.camera.camera_from_arena
         self._view, self._textures = opengl_from_arena.T.ravel().tolist(), []
         with tempfile.TemporaryDirectory() as folder:
             for i in range(24):
@@ -273,16 +267,46 @@ class Arena:
         turned = p.multiplyTransforms([0, 0, 0], [0, 0, np.sin(turn / 2), np.cos(turn / 2)], [0, 0, 0], quaternion)[1]
         p.resetBasePositionAndOrientation(body, [*xy, position[2] + 0.001], turned)
 
+    def move_to(self, poses):
+        """Put the objects where they stood when `poses` gave these, (MAX_OBJECTS, 7)."""
+        for body, pose in zip(self.bodies, poses):
+            self.bullet.resetBasePositionAndOrientation(body, pose[:3].tolist(), pose[3:].tolist())
+
+    def _render(self, fine):
+        """What Bullet draws with `fine` x `fine` rays a pixel -> rgb, z-buffer and bodies, (fine H, fine W, ...)."""
+        p, c, scale = self.bullet, self.camera, NEAR / (self.camera.fx * fine)
+        # Bullet's renderer samples at a pixel's corner; this frustum puts the corners of the fine picture where the
+        # camera model wants the pixel centres.
+        x, y = fine * c.cx + (fine - 1) / 2, fine * c.cy + (fine - 1) / 2
+        projection = p.computeProjectionMatrix(-x * scale, (fine * c.width - x) * scale,
+                                               -(fine * c.height - 1 - y) * scale, (1 + y) * scale, NEAR, FAR)
+        width, height, rgba, zbuffer, bodies = p.getCameraImage(
+            fine * c.width, fine * c.height, self._view, projection, shadow=0, lightDirection=[0.3, -0.6, 1.0],
+            renderer=p.ER_TINY_RENDERER)
+        rgb = np.reshape(rgba, (height, width, 4)).astype(np.uint8)[..., :3]
+        return rgb, np.reshape(zbuffer, (height, width)), np.reshape(bodies, (height, width))
+
+    def photograph(self, poses=None, width=640):
+        """The picture of `observe` for people: (s H, s W, 3) uint8, with the whole s that makes it about `width` wide.
+
+        Not in the paper. poses (MAX_OBJECTS, 7): where the objects shall be in it; afterwards they are where they were.
+        """
+        p, times = self.bullet, max(1, round(width / self.camera.width))
+        if poses is not None:
+            now = p.saveState()
+            self.move_to(poses)
+        rgb = self._render(2 * times)[0]  # twice as fine, so that edges are smooth
+        if poses is not None:
+            p.restoreState(now)
+            p.removeState(now)
+        return cv2.resize(rgb, (times * self.camera.width, times * self.camera.height), interpolation=cv2.INTER_AREA)
+
     def observe(self):
         """Look at the arena -> rgb (H, W, 3) uint8, depth (H, W) float32 m, labels (H, W) uint8 (truth)."""
         c, fine = self.camera, SUPERSAMPLE
-        width, height, rgba, zbuffer, bodies = self.bullet.getCameraImage(
-            fine * c.width, fine * c.height, self._view, self._projection, shadow=0, lightDirection=[0.3, -0.6, 1.0],
-            renderer=self.bullet.ER_TINY_RENDERER)
-        rgb = np.reshape(rgba, (height, width, 4)).astype(np.uint8)[..., :3]
+        rgb, zbuffer, bodies = self._render(fine)
         rgb = cv2.resize(rgb, (c.width, c.height), interpolation=cv2.INTER_AREA)
-        zbuffer, bodies = (np.reshape(each, (height, width))[fine // 2::fine, fine // 2::fine]
-                           for each in (zbuffer, bodies))
+        zbuffer, bodies = (each[fine // 2::fine, fine // 2::fine] for each in (zbuffer, bodies))
         depth = FAR * NEAR / (FAR - (FAR - NEAR) * zbuffer.astype(float))
         labels = np.zeros(depth.shape, np.uint8)
         for i, body in enumerate(self.bodies):
