@@ -170,7 +170,7 @@ def moved_scene(view, clouds):
     """The Scene of a view whose points went to clouds (J, N + M, 3) m."""
     shape = clouds.shape[:2]
     flags = {name: np.broadcast_to(getattr(view.scene, name), shape) for name in ("valid", "occupied", "stands_out")}
-    return Scene(clouds, **flags)
+    return Scene(clouds, **flags, arena=view.scene.arena)
 
 
 # --- the cost ----------------------------------------------------------------------------------------------------

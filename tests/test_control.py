@@ -121,8 +121,8 @@ def test_marks_and_goals_of_the_users_own(task):
     (lambda task, run: control.random_task(-1, 1).__enter__(), "seed"),
     (lambda task, run: control.closed_loop(task, run, "magic", SMALL), "policy: expected one of"),
     (lambda task, run: control.closed_loop(task, run, "random", SMALL, budget=0), "budget"),
-    (lambda task, run: control.closed_loop(task, replace(run, meta={"camera": vars(CAMERA)}), "random", SMALL),
-     "another camera")])
+    (lambda task, run: control.closed_loop(task, replace(run, meta={"camera": {**vars(CAMERA), "fx": 1e4}}), "random",
+                                           SMALL), "camera: fx: expected")])
 def test_refusals(refused, said, task, run):
     with pytest.raises(ValueError, match=said):
         refused(task, run)
@@ -208,14 +208,30 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
     record = control.closed_loop(task, run, "learned", SMALL, budget=5)
     np.testing.assert_array_equal(record["pokes"], pokes[:1])
     np.testing.assert_array_equal(done, pokes[:1])
+    assert record["stopped"] == "no room"
     with pytest.raises(planning.NoPoke):  # what was done is kept, but at first it is an error
         control.closed_loop(task, run, "learned", SMALL, budget=5)
 
 
-@pytest.mark.parametrize("cost, now, made", [(0.1, 0.39, 0), (0.96, 1.0, 0), (0.94, 1.0, 1)])
-def test_the_loop_ends_at_the_goal_and_where_a_poke_hardly_helps(cost, now, made, task, run, pokes, monkeypatch):
-    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, cost, now))
-    assert len(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"]) == made
+@pytest.mark.parametrize("part_of_gain, now, made, said", [
+    (2, 0.9 * control.REACHED, 0, "the goal is reached"), (0.9, 1, 0, "no plan of 2 pokes"), (1.1, 1, 1, "budget")])
+def test_the_loop_ends_at_the_goal_and_where_a_poke_hardly_helps(part_of_gain, now, made, said, task, run, pokes,
+                                                                 monkeypatch):
+    monkeypatch.setattr(control, "next_plan", lambda *_: Plan(pokes, now - part_of_gain * control.GAIN, now))
+    record = control.closed_loop(task, run, "learned", SMALL, budget=1)
+    assert len(record["pokes"]) == made and said in record["stopped"]
+
+
+def test_where_one_poke_sees_no_gain_it_looks_two_ahead(task, run, pokes, monkeypatch):
+    asked = []
+
+    def next_plan(*given):
+        asked.append(given[-2])  # the Search
+        return Plan(pokes, 0.5 if asked[-1].horizon == 2 else 1.0, 1.0)
+    monkeypatch.setattr(control, "next_plan", next_plan)
+    record = control.closed_loop(task, run, "learned", SMALL, budget=1)
+    np.testing.assert_array_equal(record["pokes"], pokes[:1])
+    assert [(search.horizon, search.candidates) for search in asked] == [(1, 16), (2, 32)]
 
 
 def test_where_bullet_finds_the_finger_s_way_taken_the_next_start_is_used_or_the_poke_is_spent(task, run, pokes,

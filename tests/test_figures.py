@@ -1,6 +1,7 @@
 """Pictures: the colours of a flow against closed form, what each panel draws, and whole, repeatable files."""
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.animation import PillowWriter
@@ -65,6 +66,21 @@ def picture(axes):
 
 
 # --- colours --------------------------------------------------------------------------------------
+
+DEFICIENCIES = {  # what is left of linear RGB: Machado, Oliveira and Fernandes (2009), the strongest form of each
+    "protanopia": [(0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)],
+    "deuteranopia": [(0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.01182, 0.04294, 0.968881)],
+    "tritanopia": [(1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.3039)]}
+
+
+@pytest.mark.parametrize("deficiency", DEFICIENCIES)
+def test_the_palette_survives(deficiency):
+    linear = np.power(figures.PALETTE, 2.2) @ np.transpose(DEFICIENCIES[deficiency])
+    left = np.float32(np.clip(linear, 0, 1) ** (1 / 2.2))
+    lab = cv2.cvtColor(left[:, None], cv2.COLOR_RGB2LAB)[:, 0]
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2) + 99 * np.eye(len(lab))
+    assert apart.min() > 12, "two colours look alike"  # 2.3 is what one just notices
+    assert apart[:3, :3].min() > 24, "the colours of the first masks look alike"
 
 @pytest.mark.parametrize("flow, rgb", [((0, 0), (1, 1, 1)), ((2, 0), (1, 0, 0)), ((0, 2), (0.5, 1, 0)),
                                        ((-2, 0), (0, 1, 1)), ((0, -2), (0.5, 0, 1)), ((1, 0), (1, 0.5, 0.5)),

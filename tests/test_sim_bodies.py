@@ -172,7 +172,7 @@ def test_data_sets_know_their_objects_by_content_wherever_the_files_lie(tmp_path
             collect(tmp_path / f"from {folder}", 6, 1, settings, spread)
     shards = [sorted((tmp_path / f"from {folder}").iterdir()) for folder in ("here", "there")]
     assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]]
-    assert len(shards[0]) == 4
+    assert len(shards[0]) == 5  # two shards, their truth, and what the collection is of
     own = collection.load_shard(shards[0][0]).settings["own"]
     assert [(each["name"], each["scale"]) for each in own] == [("box.urdf", 0.8), ("wedge.urdf", 0.8)]
     assert str(tmp_path) not in json.dumps(own)

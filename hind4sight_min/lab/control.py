@@ -13,18 +13,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import check_whole
-from ..geometry import project, unproject
+from ..geometry import Camera, project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
 from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll,
                         view_of)
 from ..scene import scene_of
-from ..sim.arena import Arena, Settings
+from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
-from ..training import check_camera
+from .cameras import check_camera
 from .marks import follow, places_at, points_at
 
-SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
+SETTINGS = Settings(**{**MIDDLE, "place_within": 0.56})  # so that the finger gets behind every object
 IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 REACHED = 0.4  # cost below which the goal counts as reached: less than followed marks and pixels can tell
@@ -36,8 +36,9 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 # --- tasks --------------------------------------------------------------------------------------------------------
 
 def settings_for(run, settings=SETTINGS):
-    """Settings, those of the test scenes, in pictures of the size that a run was trained with."""
-    return replace(settings, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
+    """Settings, those of the test scenes, in pictures of the size that a run was trained with if they are 4:3."""
+    width, height = run.meta["camera"]["width"], run.meta["camera"]["height"]
+    return replace(settings, width=width, height=height) if 3 * width == 4 * height else settings
 
 
 @dataclass
@@ -196,6 +197,11 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
+def two_ahead(search):
+    """A planning.Search that looks two pokes ahead, with twice the candidates: the space of plans is larger."""
+    return replace(search, horizon=2, candidates=min(2 * search.candidates, 10_000))
+
+
 def next_plan(policy, task, view, labels, goal, run, search, rng):
     """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle."""
     arena, settings = task.arena, task.settings
@@ -250,27 +256,37 @@ def distances(poses, task):
 def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
-    Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance (T+1, M) m, angle
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. Where one
+    poke ahead sees no gain, it looks two ahead: of two objects that must swap one has to make room first.
+    stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance (T+1, M) m, angle
     (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task movers, goal_marks,
-    goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
+    goal_rgb. Raises ValueError for a camera that cannot show the run its arena, and NoPoke where not even the
     first poke is possible; later on that ends the loop, as an empty arena does.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
     check_whole("budget", budget, 1, 1000)
     arena, rng = task.arena, np.random.default_rng(seed)
-    check_camera(run, arena.camera)
+    check_camera(arena.camera, Camera(**run.meta["camera"]))
     (rgb, depth, labels), view, goal = first_look(task)
     states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
+    stopped = f"the budget of pokes, {budget}, is spent"
     while len(pokes) < budget:
         try:
             found = next_plan(policy, task, view, labels, goal, run, search, rng)
-        except NoPoke:
+            if search.horizon == 1 and found.now >= REACHED and found.cost > found.now - GAIN:
+                found = next_plan(policy, task, view, labels, goal, run, two_ahead(search), rng)
+        except NoPoke as none:
             if not pokes:
                 raise
+            stopped = str(none)
             break
-        if found.now < REACHED or found.cost > found.now - GAIN:
+        if found.now < REACHED:
+            stopped = f"the goal is reached: what is left costs {found.now:.2f}, less than {REACHED:g}"
+            break
+        if found.cost > found.now - GAIN:
+            stopped = (f"no plan of {max(search.horizon, 2)} pokes is predicted to help: what is left costs "
+                       f"{found.now:.2f}, after the best one {found.cost:.2f}")
             break
         pokes.append(found.pokes[0])
         starts.append(carry_out(arena, view, pokes[-1], task.settings))
@@ -279,9 +295,10 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
         if np.isfinite(starts[-1]).all():
             marks = follow(view, predict(run.params, run.recipe.sizes, view.scene, pokes[-1][None]), scene)
         states.append((rgb, arena.poses(), marks, *distances(arena.poses(), task)))
-        if not scene.occupied.any():  # the last object left the arena
+        if not scene.occupied.any():
+            stopped = "the last object has left the arena"
             break
         view = view_of(scene, marks)
     record = dict(zip(("rgb", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
-    return {**record, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
+    return {**record, "stopped": stopped, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
             "movers": task.movers, "goal_marks": task.goal_marks, **({"goal_rgb": task.goal[0]} if task.goal else {})}

@@ -5,23 +5,31 @@ Image panels show pixels as they are, (0, 0) top left. Arena panels are seen fro
 up, so that the camera looks in from the lower edge. A panel's Axes carry their name as label.
 """
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.patheffects import Normal, withStroke
 
-from ..disk.files import whole_file
+from ..disk.files import check_output, whole_file
 from ..geometry import project
 from ..interactions import grid_shape
 from ..losses import distance_maps, seen_in_both, warp_backward
 from .evaluation import MOVING, true_motion
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart: one per mask (or object).
-PALETTE = np.array([(230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178),
-                    (213, 94, 0)]) / 255
-PREDICTED, TRUE, GOAL, POKE = PALETTE[5], PALETTE[6], PALETTE[4], "black"
+# --- the palette of every picture ------------------------------------------------------------------------
+# Okabe and Ito's colours: readers with any of the common colour-vision deficiencies tell each from each.
+ORANGE, SKY, GREEN, PINK, YELLOW, BLUE, RED = np.array([
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (204, 121, 167), (240, 228, 66), (0, 114, 178), (213, 94, 0)]) / 255
+PALETTE = np.array([ORANGE, SKY, BLUE, RED, YELLOW, GREEN, PINK])  # one per mask or object; least like grey first
+PREDICTED, TRUE, GOAL, POKE = BLUE, RED, YELLOW, "black"
+TERM_COLOURS = {"chamfer": BLUE, "distance_smoothness": SKY, "photometric": RED, "flow_smoothness": ORANGE,
+                "inverse": GREEN, "binary_masks": PINK}
+DISTANCES, ERRORS, SHARES = "viridis", "magma", "cividis"  # colour maps: brighter is more, to every eye
 OUTLINE = [withStroke(linewidth=3.5, foreground="white"), Normal()]  # lines stay visible on any picture
 
 
@@ -66,9 +74,9 @@ def show_image(axes, picture, title, **how):
 
 
 def draw_arrow(axes, start, target):
-    """The poke, with a white outline, from start to target (2,) in the panel's units. Not in the paper."""
-    axes.add_patch(FancyArrowPatch(start, target, arrowstyle="-|>", mutation_scale=14, linewidth=2, color=POKE,
-                                   shrinkA=0, shrinkB=0, path_effects=OUTLINE, zorder=5))
+    """The poke, with a white outline, from start to target (2,) in the panel's units -> the patch. Not in the paper."""
+    return axes.add_patch(FancyArrowPatch(start, target, arrowstyle="-|>", mutation_scale=14, linewidth=2, color=POKE,
+                                          shrinkA=0, shrinkB=0, path_effects=OUTLINE, zorder=5))
 
 
 def blend(image, weights):
@@ -86,6 +94,45 @@ def on_table(places, camera):
     """Places (..., 2) m on the arena's plane -> pixels (..., 2). Not in the paper."""
     places = np.asarray(places, float)
     return project(np.concatenate([places, 0 * places[..., :1]], axis=-1), camera)
+
+
+def next_picture(image, flow, depth):
+    """The next picture as predicted: each of its pixels takes its colour from where it comes from in this one.
+
+    Not in the paper, which warps I_{t+1} back to compare (Sec. III-C); here the same `warp_backward` goes along the
+    reversed flow. Of points that land on one pixel the nearest counts. Where none lands something comes to sight that
+    nobody knows: it gets the colour that most of the picture has. image (H, W, 3) in [0, 1], flow (H, W, 2) px, depth
+    (H, W) m of the predicted points -> (H, W, 3) in [0, 1].
+    """
+    height, width = depth.shape
+    there = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + flow
+    far_first = np.argsort(-depth, axis=None)
+    moved = np.linalg.norm(flow, axis=-1) > 0.25  # px
+    back = np.full(flow.shape, np.nan, np.float32)
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1), None):  # all around, against gaps; then, above that, the nearest
+        cells = (np.rint(there) if corner is None else np.floor(there) + corner).astype(int)
+        lands = (cells >= 0).all(axis=-1) & (cells < [width, height]).all(axis=-1) & (moved | (corner is None))
+        order = far_first[lands.ravel()[far_first]]
+        columns, rows = cells.reshape(-1, 2)[order].T
+        back[rows, columns] = -flow.reshape(-1, 2)[order]
+    warped = np.clip(warp_backward(image[None], np.nan_to_num(back)[None])[0][0], 0, 1)
+    unknown = cv2.dilate(np.uint8(np.isnan(back[..., 0])), np.ones((3, 3), np.uint8)) > 0  # and the blurred rim
+    unknown &= ~(np.linalg.norm(back, axis=-1) > 0.25)
+    return np.where(unknown[..., None], np.median(image, axis=(0, 1)), warped)
+
+
+def arrow_lines(starts, ends):
+    """Arrows from starts to ends (n, 2) as polylines (n, 5, 2), which can be moved quickly. Not in the paper."""
+    back = 0.3 * (starts - ends)
+    aside = back[:, ::-1] * [0.5, -0.5]
+    return np.stack([starts, ends, ends + back + aside, ends, ends + back - aside], axis=1)
+
+
+def scene_flow_lines(points, flow, valid):
+    """Some of the points (N, 3) m that move, as arrows seen from above: polylines (n, 5, 2). Not in the paper."""
+    moving = np.flatnonzero(valid & (np.linalg.norm(flow, axis=1) > MOVING))
+    moving = moving[::len(moving) // 16 + 1]
+    return arrow_lines(points[moving, :2], (points + flow)[moving, :2])
 
 
 BELOW, ARENA = {"location": "bottom", "shrink": 0.8}, {"xlabel": "x [m]", "ylabel": "y [m]"}
@@ -113,8 +160,9 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
 
 
-def _draw_wheel(axes, scale, low):
-    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px."""
+def draw_wheel(axes, scale, low):
+    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px. Not in the paper.
+    """
     y = 0.02 if low else 0.68
     wheel = axes.inset_axes((0.02, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))
@@ -126,7 +174,7 @@ def _draw_heatmap(axes, heatmap, place, arena, which, symbol):
     """A heat-map over the arena's cells, and the true place (2,) m in it."""
     half = arena / 2
     axes.set(title=f"Inverse model: {which} $\\hat {symbol}_t$ (Sec. III-E)", **ARENA)
-    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap="cividis", vmin=0,
+    shown = axes.imshow(heatmap, interpolation="nearest", origin="lower", cmap=SHARES, vmin=0,
                         extent=(-half, half, -half, half))
     axes.plot(*place, "o", markersize=11, fillstyle="none", color=TRUE, markeredgewidth=2, path_effects=OUTLINE,
               label=f"true {which}")
@@ -144,14 +192,14 @@ def _draw_losses(panels, answer):
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
-                       cmap=colormaps["magma"].with_extremes(bad="0.6"), vmin=0)
+                       cmap=colormaps[ERRORS].with_extremes(bad="0.6"), vmin=0)
     panels["error"].figure.colorbar(shown, ax=panels["error"], label="sum over R, G, B", **BELOW)
     distances = 100 * np.sqrt(distance_maps(answer.prediction.points, after.points, valid, next_valid))  # cm
     both = [panels["distance_predicted"], panels["distance_observed"]]
     titles = "predicted to observed\n$D_{\\hat P \\to P}$", "observed to predicted\n$D_{P \\to \\hat P}$"
     for axes, title, distance in zip(both, titles, distances):
-        shown = show_image(axes, distance.reshape(error.shape), f"Distance {title} (Eq. 2)", vmin=0,
-                           vmax=distances.max())
+        shown = show_image(axes, distance.reshape(error.shape), f"Distance {title} (Eq. 2)", cmap=DISTANCES,
+                           vmin=0, vmax=distances.max())
     both[0].figure.colorbar(shown, ax=both, label="square root of D, cm", **BELOW)
 
 
@@ -198,7 +246,7 @@ def interaction_figure(interactions, row, answer, truth=None):
         show_image(panels[label], picture, title)
     arrow = on_table([start, poke[:2]], camera)
     draw_arrow(panels["before"], *arrow)
-    _draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
+    draw_wheel(panels["flow"], scale, low=arrow[1, 1] <= camera.height / 2)  # away from the target
     _draw_losses(panels, answer)
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      settings["arena"])
@@ -226,7 +274,8 @@ def training_figure(log, no_motion={}):
     for i, name in enumerate(names):
         axes = figure.add_subplot(rows, columns, i + 1, label=name)
         values = [entry[name] for entry in log]
-        axes.plot([entry["step"] for entry in log], values, ".-", color=PREDICTED, markersize=5, linewidth=1.5)
+        axes.plot([entry["step"] for entry in log], values, ".-", color=TERM_COLOURS.get(name, "black"), markersize=5,
+                  linewidth=1.5)
         if name in no_motion:
             axes.axhline(no_motion[name], linestyle="--", color="0.4", linewidth=1.2, label="no motion")
             axes.legend(fontsize=8)
@@ -235,6 +284,67 @@ def training_figure(log, no_motion={}):
         axes.set(title=f"{name.replace('_', ' ')}\n{TERMS.get(name, '')}".strip(), xlabel="step")
         axes.grid(alpha=0.3)
     return figure
+
+
+# --- the explorer -------------------------------------------------------------------------------------------------
+
+EXPLORER = [["camera", "camera", "masks", "above"], ["camera", "camera", "flow", "above"],
+            ["seen", "predicted", "truth", "distance"]]
+TITLES = {"camera": "Click where the finger shall stop, drag the way it pushes",
+          "masks": "Masks: what moves as one", "flow": "Optical flow: where each pixel goes",
+          "above": "Scene flow: where the points go, from above", "seen": "What the model sees: {} x {} pixels",
+          "predicted": "Predicted: these pixels, warped along the flow", "truth": "What really happened, after poke!",
+          "distance": "From predicted points to seen ones (Eq. 2)"}
+SHOWN = 0.08  # m; so much flow has the full colour
+BLANK = "0.93"  # grey
+
+
+def explorer_panels(figure, camera, settings, buttons):
+    """What the explorer draws on an empty figure -> a namespace of its artists. Not in the paper.
+
+    live: those that follow the mouse, which are drawn by hand, in this order. axes, images: by the names in EXPLORER;
+    image coordinates are pixels of the model's picture, whatever picture is shown. buttons: {key: text}.
+    """
+    width, height, half = camera.width, camera.height, 0.53 * settings["arena"]
+    axes = figure.subplot_mosaic(EXPLORER, gridspec_kw={"left": 0.01, "right": 0.945, "top": 0.965, "bottom": 0.14,
+                                                        "wspace": 0.06, "hspace": 0.17})
+    images = {name: show_image(axes[name], np.full((height, width), np.nan), "", vmin=0, vmax=3,  # cm
+                               extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+                               cmap=colormaps[DISTANCES].with_extremes(bad=BLANK)) for name in axes if name != "above"}
+    for name, title in TITLES.items():
+        axes[name].set_title(title.format(width, height), fontsize=9.5)
+    draw_wheel(axes["flow"], SHOWN / camera.pixel_size, low=True)
+    bar = axes["distance"].inset_axes((0.1, -0.09, 0.6, 0.05))
+    figure.colorbar(images["distance"], cax=bar, orientation="horizontal").set_label("cm", loc="right")
+    above, view = axes["above"], axes["camera"]
+    above.set(aspect="equal", anchor="N", xlim=(-half, half), ylim=(-half, half), **ARENA)
+    above.yaxis.tick_right()
+    above.yaxis.set_label_position("right")
+
+    def lines(axes, colour, width, label=None):
+        axes.plot([], [], color=colour, label=label)
+        return axes.add_collection(LineCollection([], colors=[colour], linewidths=width))
+    art = SimpleNamespace(
+        axes=axes, images=images, points=above.scatter([], [], s=9, linewidths=0),
+        true=lines(above, TRUE, 2.6, "what really happened, after poke!"),
+        predicted=lines(above, PREDICTED, 1.1, "predicted"),
+        others=lines(view, "white", 0.8), elites=lines(view, GOAL, 1.6),
+        arrows=[draw_arrow(each, (0, 0), (1, 1)) for each in (view, axes["seen"], above)],
+        ways=view.plot([], [], ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)[0],
+        rings=view.plot([], [], "o", color=GOAL, markersize=11, fillstyle="none", markeredgewidth=2,
+                        path_effects=OUTLINE)[0],
+        stars=view.plot([], [], "*", color=GOAL, markersize=13, markeredgecolor="black")[0],
+        text=figure.text(0.012, 0.068, "", fontsize=10.5),
+        buttons={key: figure.text(0.02 + 0.125 * i, 0.022, text, bbox={"boxstyle": "round", "facecolor": BLANK,
+                                                                       "edgecolor": "0.5"})
+                 for i, (key, text) in enumerate(buttons.items())})
+    above.legend(loc="upper left", bbox_to_anchor=(0, -0.14), fontsize=8.5, frameon=False)
+    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), *axes["flow"].child_axes,
+                *axes["flow"].texts, art.predicted, art.others, art.elites, *art.arrows, art.ways, art.rings, art.stars,
+                art.text]
+    for artist in art.live:
+        artist.set_animated(True)
+    return art
 
 
 # --- planning -----------------------------------------------------------------------------------------------------
@@ -273,9 +383,23 @@ def save_sequence(path, record, camera):
                 writer.grab_frame()
 
 
+def save_film(path, frames, seconds):
+    """Write pictures (H, W, 3) uint8 as a GIF that goes on for ever, whole or not at all. Not in the paper.
+
+    One palette for all. seconds: how long each is shown. Raises ValueError for a path that does not end in .gif.
+    """
+    from PIL import Image
+    check_output("path", path, ".gif")
+    some = np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2]
+    palette = Image.fromarray(some).quantize(192)
+    first, *others = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    with whole_file(path) as temporary:
+        first.save(temporary, save_all=True, append_images=others, duration=round(1000 * seconds), loop=0)
+
+
 STYLES = {"learned": ("learned model, mean", PREDICTED, "-"),
-          "oracle": ("the simulator as the model", PALETTE[2], "--"),
-          "random": ("random pokes", PALETTE[3], ":"), "no_motion": ("model of no motion", "0.4", "-.")}
+          "oracle": ("the simulator as the model", GREEN, "--"),
+          "random": ("random pokes", PINK, ":"), "no_motion": ("model of no motion", "0.4", "-.")}
 
 
 def control_figure(curves, pokes):
