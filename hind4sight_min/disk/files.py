@@ -102,7 +102,7 @@ def only_one(path):
                 file.write(this_process())
             break
         except FileExistsError:
-            process = lock.read_text(errors="replace")[:99]
+            process = " ".join(lock.read_text(errors="replace").split())[:99]
             if is_dead(process):
                 lock.unlink(missing_ok=True)
     else:

@@ -13,7 +13,7 @@ import numpy as np
 from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, shipped, write_json
-from ..disk.shards import load_interactions
+from ..disk.shards import load_interactions, stream_interactions
 from ..networks import Sizes
 from ..sim.arena import Settings
 from ..sim.collection import collect
@@ -118,7 +118,7 @@ def run_train(args):
     from . import figures
     out = Path(args.out)
     check_output("out", out, ".npz")  # a folder of pokes without a checkpoint after it has another ending
-    interactions = load_interactions(args.data)
+    interactions = stream_interactions(args.data)
     given = {name: value for name, value in vars(args).items() if value is not None and name not in (
         "command", "function", "data", "out", "jobs", "json", "resume")}
     if args.resume and given:
