@@ -149,11 +149,11 @@ def draw(path, operations, step):
     """The figure of docs/speed.md, from the recorded figures of this benchmark and of training_step.py."""
     from matplotlib.figure import Figure
 
-    from hind4sight_min.lab.figures import save_figure
+    from hind4sight_min.lab.figures import BLUE, GREEN, ORANGE, RED, SKY, save_figure
     figure = Figure(figsize=(11, 3.6), dpi=110, layout="constrained")
     axes = figure.subplots(1, 3)
-    styles = {"ours": ("#0072B2", "o"), "torch_1_threads": ("#E69F00", "s"), "torch_2_threads": ("#D55E00", "s"),
-              "point_cloud_utils": ("#009E73", "^"), "scipy": ("#009E73", "^")}
+    styles = {"ours": (BLUE, "o"), "torch_1_threads": (ORANGE, "s"), "torch_2_threads": (RED, "s"),
+              "point_cloud_utils": (GREEN, "^"), "scipy": (GREEN, "^")}
     for axis, what, names, sizes, title, unit in (
             (axes[0], "chamfer", CHAMFER, {str(n): n for n in POINTS}, "Chamfer distance: like N log N", "points"),
             (axes[1], "warp", WARP, {f"{h}x{w}": h * w for h, w in PICTURES}, "Warping: behind grid_sample", "pixels")):
@@ -167,10 +167,10 @@ def draw(path, operations, step):
     scale = operations["chamfer_10000_ours_ms"] / (1e4 * np.log(1e4))
     axes[0].loglog(n, scale * n * np.log(n), ":", color="grey")
     batches = (4, 16, 64)
-    for name, colour, marker, label in (("ours_1_process", "#56B4E9", "o", "ours, 1 process"),
-                                        ("ours_2_processes", "#0072B2", "o", "ours, 2 processes"),
-                                        ("torch_tree_eager_1_threads", "#E69F00", "s", "torch, 1 thread"),
-                                        ("torch_tree_eager_2_threads", "#D55E00", "s", "torch, 2 threads")):
+    for name, colour, marker, label in (("ours_1_process", SKY, "o", "ours, 1 process"),
+                                        ("ours_2_processes", BLUE, "o", "ours, 2 processes"),
+                                        ("torch_tree_eager_1_threads", ORANGE, "s", "torch, 1 thread"),
+                                        ("torch_tree_eager_2_threads", RED, "s", "torch, 2 threads")):
         values = [step.get(f"{name}_batch_{batch}_ms", np.nan) for batch in batches]
         axes[2].loglog(batches, values, color=colour, marker=marker, label=label)
     axes[2].set(title="A training step of the full model", xlabel="interactions per step", ylabel="ms")

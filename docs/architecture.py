@@ -14,13 +14,13 @@ import numpy as np
 from hind4sight_min import networks, scene, training
 from hind4sight_min.geometry import poke_frame
 from hind4sight_min.disk.shards import load_interactions
-from hind4sight_min.lab.figures import PALETTE, save_figure
+from hind4sight_min.lab.figures import GREEN, ORANGE, SKY, save_figure
 
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 ROOT = Path(__file__).resolve().parent.parent
-INPUT, FORWARD, INVERSE, LOSS = "0.92", *(0.65 + 0.35 * PALETTE[[1, 2, 0]])
+INPUT, FORWARD, INVERSE, LOSS = "0.92", *(0.65 + 0.35 * colour for colour in (SKY, GREEN, ORANGE))
 
 # name -> (x, y of the middle, what stands in the box, colour)
 BOXES = {

@@ -18,7 +18,7 @@ from hind4sight_min.geometry import optical_flow
 from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab import evaluation
 from hind4sight_min.lab.cli import data_small
-from hind4sight_min.lab.figures import blend, draw_arrow, flow_to_rgb, on_table, save_figure, show_image
+from hind4sight_min.lab.figures import TERM_COLOURS, blend, draw_arrow, flow_to_rgb, on_table, save_figure, show_image
 from hind4sight_min.lab.noise import with_depth_noise
 from hind4sight_min.sim.arena import Settings
 from hind4sight_min.sim.collection import collect
@@ -31,8 +31,6 @@ from results import page_with  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 DOCS = Path(__file__).resolve().parent
-COLOURS = {"chamfer": "#0072B2", "distance_smoothness": "#56B4E9", "photometric": "#D55E00",
-           "flow_smoothness": "#E69F00"}
 
 
 def moved_labels(truth, row):
@@ -78,9 +76,9 @@ def landscape(interactions, truth, count=60):
                 (axes[line, 0], scales, [scale * true for scale in scales], "share of the true scene flow"),
                 (axes[line, 1], angles, [turned(angle) for angle in angles], "turn added to the true motion, degrees")):
             curves = [terms_at(scene, next_scene, flow, interactions.camera) for flow in flows]
-            for name, colour in COLOURS.items():
+            for name in curves[0]:
                 values = np.array([curve[name].mean() for curve in curves])
-                panel.plot(sweep, values - values.min(), color=colour, label=name.replace("_", " "))
+                panel.plot(sweep, values - values.min(), color=TERM_COLOURS[name], label=name.replace("_", " "))
             panel.axvline(1 if panel is axes[line, 0] else 0, color="grey", linestyle=":")
             panel.set_xlabel(label)
         axes[line, 0].set_ylabel(f"weighted term less its minimum\n{'1 cm depth noise' if noise else 'no noise'}")

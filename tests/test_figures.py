@@ -1,6 +1,7 @@
 """Pictures: the colours of a flow against closed form, what each panel draws, and whole, repeatable files."""
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.animation import PillowWriter
@@ -22,8 +23,8 @@ POSE = np.diag([1.0, -1, -1, 1])
 POSE[2, 3] = 0.5
 CAMERA = Camera(W, H, 10.0, 10.0, 3.5, 2.5, POSE)  # half a metre above the table, looking down: 5 cm a pixel
 SHIFT, TRUE_SHIFT = np.float32([0.03, 0.02, 0]), np.float32([0.02, 0.03, 0])
-PANELS = ["before", "masks", "labels", "flow", "true_flow", "after", "warped", "error", "distance_predicted",
-          "distance_observed", "scene_flow", "start", "end"]
+PANELS = ["photo_before", "before", "masks", "flow", "photo_after", "after", "labels", "true_flow", "warped", "error",
+          "distance_predicted", "distance_observed", "scene_flow", "start", "end"]
 
 
 def example(flow=(1.0, 0.0), missing=(), moves=1.0):
@@ -65,6 +66,21 @@ def picture(axes):
 
 
 # --- colours --------------------------------------------------------------------------------------
+
+DEFICIENCIES = {  # what is left of linear RGB: Machado, Oliveira and Fernandes (2009), the strongest form of each
+    "protanopia": [(0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)],
+    "deuteranopia": [(0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.01182, 0.04294, 0.968881)],
+    "tritanopia": [(1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.3039)]}
+
+
+@pytest.mark.parametrize("deficiency", DEFICIENCIES)
+def test_the_palette_survives(deficiency):
+    linear = np.power(figures.PALETTE, 2.2) @ np.transpose(DEFICIENCIES[deficiency])
+    left = np.float32(np.clip(linear, 0, 1) ** (1 / 2.2))
+    lab = cv2.cvtColor(left[:, None], cv2.COLOR_RGB2LAB)[:, 0]
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2) + 99 * np.eye(len(lab))
+    assert apart.min() > 12, "two colours look alike"  # 2.3 is what one just notices
+    assert apart[:3, :3].min() > 24, "the colours of the first masks look alike"
 
 @pytest.mark.parametrize("flow, rgb", [((0, 0), (1, 1, 1)), ((2, 0), (1, 0, 0)), ((0, 2), (0.5, 1, 0)),
                                        ((-2, 0), (0, 1, 1)), ((0, -2), (0.5, 0, 1)), ((1, 0), (1, 0.5, 0.5)),
@@ -137,14 +153,37 @@ def test_the_poke_and_the_true_cells_are_marked():
     data, _, drawn = drawn_example()
     ends = [data.starts[0], data.pokes[0, :2]]
     pixels = [(3.5 + 20 * x, 2.5 - 20 * y) for x, y in ends]  # 5 cm a pixel
-    for name, (start, target) in (("before", pixels), ("scene_flow", ends)):
-        (arrow,) = drawn[name].patches
+    for name, (start, target) in (("before", pixels), ("photo_before", pixels), ("scene_flow", ends)):
+        arrow = drawn[name].patches[0]
         np.testing.assert_allclose(arrow._posA_posB, [start, target], rtol=1e-5)
     for name, place in zip(("start", "end"), ends):
         assert drawn[name].images[0].get_extent() == [-ARENA / 2, ARENA / 2, -ARENA / 2, ARENA / 2]
         assert drawn[name].images[0].origin == "lower"
         np.testing.assert_allclose(drawn[name].lines[0].get_xydata(), [place])
     assert "29\u00b0" in drawn["before"].figure.figure._suptitle.get_text()  # 0.5 rad
+
+
+def test_photographs_are_shown_whole_and_all_else_near_the_poke():
+    data, row, answer, _ = example()
+    photographs = np.random.default_rng(1).integers(0, 256, (2, 10 * H, 10 * W, 3), np.uint8)
+    drawn = panels(figures.interaction_figure(data, row, answer, None, photographs))
+    assert "labels" not in drawn and "true_flow" not in drawn
+    target = 3.5 + 20 * 0.1, 2.5  # px
+    for name, photograph in zip(("photo_before", "photo_after"), photographs):
+        assert (picture(drawn[name]) == photograph).all() and drawn[name].get_xlim() == (-0.5, W - 0.5), name
+        (left, bottom), right = drawn[name].patches[-1].get_xy(), drawn["before"].get_xlim()[1]
+        assert (left, right - left) == (drawn["before"].get_xlim()[0], W / 2), "the frame is not what the others show"
+        assert left <= target[0] <= right and bottom <= target[1] <= bottom + H / 2
+
+
+def test_a_flow_is_also_drawn_as_arrows():
+    flow = np.zeros((H, W, 2))
+    flow[1, 4], flow[4, 7], flow[2, 2] = (2, -1), (0, 3), (1, 1)  # the last lies between those that get an arrow
+    axes = figures.Figure().add_subplot()
+    figures.show_flow(axes, flow, 3.0, "")
+    (arrows,) = [each for each in axes.collections if hasattr(each, "U")]
+    found = np.column_stack([arrows.get_offsets(), arrows.U, arrows.V])
+    np.testing.assert_allclose(found, [(4, 1, 2, -1), (7, 4, 0, 3)], err_msg="x and y, or U and V, swapped?")
 
 
 # --- training -------------------------------------------------------------------------------------
@@ -181,6 +220,7 @@ def test_save_sequence_draws_a_frame_per_picture_and_the_pokes_that_have_a_start
 
     def look(writer):
         axes = writer.fig.axes[0]
+        assert len(writer.fig.axes) == 2, "the picture, and the goal's"
         frames.append((axes.get_title(), [arrow._posA_posB for arrow in axes.patches], axes.lines[1].get_xydata()))
         grab(writer)
     monkeypatch.setattr(PillowWriter, "grab_frame", look)

@@ -1,7 +1,6 @@
 """Collection: which pokes are kept, what a shard promises, folders that grow shard by shard."""
 import shutil
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import asdict
 from multiprocessing import get_context
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hind4sight_min.geometry import unproject
-from hind4sight_min.disk.files import plain
 from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.sim import collection
 from hind4sight_min.sim.arena import Arena, Settings
@@ -61,7 +59,7 @@ def shard():
 def test_a_shard_keeps_its_promises(changed):
     settings = Settings(**changed)
     interactions, truth = collect_shard(settings, 0, 0, 5)
-    assert interactions.settings == plain(asdict(settings))
+    assert interactions.settings == settings.plain
     assert interactions.meta["counts"]["kept"] == len(interactions) == len(truth.labels) == 5
     assert interactions.depth_before.shape == truth.labels.shape == (5, settings.height, settings.width)
     travel = interactions.pokes[:, :2] - interactions.starts

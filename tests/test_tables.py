@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_rel
 from test_se3nets import moved_blocks
 from tiny import TINY, camera, tiny_pokes
 
@@ -52,17 +53,18 @@ def test_every_model_is_trained_with_its_own_terms_for_the_same_budget(model):
         assert noisy.keywords == {"window": window, "depth_noise": 0.01}
 
 
-def test_training_test_and_unseen_pokes_are_three_things(tmp_path, monkeypatch):
+def test_no_test_shares_a_seed_with_another_and_only_unseen_has_what_was_held_out(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
     calls = {}
     monkeypatch.setattr(tables, "collect", lambda folder, *given: calls.update({folder.name: given}))
     tables.collect_data(tmp_path, tables.FULL)
-    assert {name: call[0] for name, call in calls.items()} == {"train": 24000, "test": 1000, "unseen": 1000}
-    assert len({call[1] for call in calls.values()}) == 3, "two of them have the same seed"
+    pokes = {"train": 48000, "test": 1000, "unseen": 4000, "known": 4000, "all_over": 1000, "crowded": 1000}
+    assert {name: call[0] for name, call in calls.items()} == pokes
+    assert len({call[1] for call in calls.values()}) == len(calls), "two of them have the same seed"
     for kind in ("kinds", "textures"):
         drawn = {name: set(getattr(call[2], kind)) for name, call in calls.items()}
-        assert drawn["unseen"] == set(HELD_OUT[kind])
-        assert drawn["train"] == drawn["test"] and not drawn["train"] & drawn["unseen"]
+        assert drawn["unseen"] == set(HELD_OUT[kind]) and not drawn["train"] & drawn["unseen"]
+        assert drawn["test"] == drawn["known"] <= drawn["train"] == drawn["all_over"]
 
 
 # --- runs that go on ----------------------------------------------------------------------------------------------
@@ -71,7 +73,7 @@ def test_a_cell_goes_on_where_it_was_and_is_run_once(tmp_path, small_world, monk
     cell = Cell("full", "clean", 1, long=True)
     whole = tables.run_cell(cell, tmp_path / "whole", TINY_SCALE)
     assert whole["train_seconds"] > 0 and "unseen_flow_mse_ratio" in whole
-    assert small_world == ["train", "test", "unseen"], "trained on the one, evaluated on the others"
+    assert small_world == ["train", *tables.TESTS], "trained on the one, evaluated on the others"
     save, parts = runs.save_run, tmp_path / "parts" / "cells"
 
     def stop_at_two(path, run):
@@ -149,6 +151,17 @@ def test_summary_is_mean_and_sd_over_the_seeds(figures):
     assert figures["seeds"] == TINY_SCALE.seeds and figures["steps"] == TINY_SCALE.steps
 
 
+def test_the_order_of_the_ablation_is_told_by_differences_within_a_seed():
+    ratios = {"2d": (0.30, 0.34, 0.35), "2d_3d": (0.20, 0.23, 0.22), "full": (0.19, 0.23, 0.24), "3d": (0.4, 0.5, 0.6)}
+    found = tables.summarise({Cell(model, noise, seed): {"flow_mse_ratio": value} for model, values in ratios.items()
+                              for noise in tables.NOISES for seed, value in enumerate(values)}, TINY_SCALE)
+    assert found["2d_less_2d_3d_clean"] == pytest.approx((0.10 + 0.11 + 0.13) / 3)
+    interval = ttest_rel(ratios["2d"], ratios["2d_3d"]).confidence_interval(0.95)
+    assert found["2d_less_2d_3d_noisy_ci95"] == pytest.approx((interval.high - interval.low) / 2), "not paired by seed?"
+    row = next(line for line in tables.order_table(found).splitlines() if line.startswith("| 2D loss + 3D loss less full"))
+    assert row == f"| 2D loss + 3D loss less full model | clean | 0.004 | 0.040, 0.039 | -0.003 \u00b1 {0.0379:.3f} |"
+
+
 def test_the_papers_claims_by_hand(figures):
     claims = results.claims(figures)
     for name, value in {"flow_epe_ratio": 3 / 4, "unseen_over_seen": 2, "noisy_over_se3nets_da11": 1.55 / 6.55,
@@ -186,7 +199,7 @@ def record(distance):
     poses = np.zeros((len(distance), 7, 7))
     poses[1:, 1, 0], poses[1:-1, 2, 1] = 0.2, 0.03
     return {"poses": poses, "distance": np.array(distance)[:, None], "movers": np.array([1]), "pokes": np.zeros((2, 3)),
-            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1))}
+            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1)), "stopped": "no room"}
 
 
 def test_the_outcome_of_a_run_by_hand():
@@ -194,6 +207,7 @@ def test_the_outcome_of_a_run_by_hand():
     assert found["distance_m"] == pytest.approx([0.12, 0.02] + [0.05] * 9), "the present distance, not the best so far"
     assert found["others_shifted_m"] == pytest.approx(0.03), "of what was not to be moved, at its farthest"
     np.testing.assert_allclose(found["angles_deg"], [[40], [10]])
+    assert found["stopped"] == "no room"
 
 
 def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypatch):
@@ -239,6 +253,7 @@ def test_summary_of_the_control_experiment_by_hand():
     figures, curves = tables.summarise_planning(found)
     assert curves["learned", 1].shape == (2, 11)
     for name, value in {"learned_2_left": 0.06 / 0.4, "learned_2_left_sd": (0.4 - 0.02 / 0.3) / np.sqrt(2),
+                        "learned_2_worst": 0.4, "plan_worst_scene": 0.4,
                         "plan_over_oracle": 2, "learned_1_angle_start_deg": 20, "learned_1_angle_deg": 8,
                         "learned_obstacle_avoided": 2 / 3, "greedy_obstacle_avoided": 1 / 3,
                         "greedy_obstacle_shift_cm": 5 / 3}.items():

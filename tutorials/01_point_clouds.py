@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from hind4sight_min import geometry
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, GREEN, PINK, RED
 
 options = lesson.begin("01_point_clouds")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -121,7 +121,7 @@ for name, height in heights.items():
     print(f"   {name}: {np.abs(height[inside]).max():.2f}")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained", sharey=True)
-colours = ("black", PALETTE[6], PALETTE[5], PALETTE[3])
+colours = ("black", RED, BLUE, PINK)
 styles = ("-", "--", "-.", ":")
 for (name, height), colour, style in zip(heights.items(), colours, styles):
     axes[0].plot(u_grid[v, inside[v]], height[v, inside[v]], style, color=colour, linewidth=2, label=name)
@@ -215,17 +215,17 @@ print(f"5. {np.sum(~valid)} pixels miss their depth in the picture itself, {np.s
 print(f"   the object's centre moves by {naive_error:.1f} cm if they count, by {masked_error:.1f} cm if not")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained", width_ratios=(1, 0.8))
-with_holes = plt.get_cmap("viridis").with_extremes(bad=PALETTE[6])
+with_holes = plt.get_cmap("viridis").with_extremes(bad=RED)
 shown = axes[0].imshow(np.where(holed_valid, broken, np.nan), cmap=with_holes)
 axes[0].set(xlabel="column u [px]", ylabel="row v [px]")
 axes[0].set_title("depth with a hole (orange)", fontsize=11)
 figure.colorbar(shown, ax=axes[0], label="Z [m]", pad=0.02)
 side = axes[1]
 side.scatter(*holed[holed_valid][:, 1:].T, s=5, color="0.75", linewidths=0, label="points of the cloud")
-side.scatter(*holed[on_object & holed_valid][:, 1:].T, s=10, color=PALETTE[2], linewidths=0,
+side.scatter(*holed[on_object & holed_valid][:, 1:].T, s=10, color=GREEN, linewidths=0,
              label="the object's points")
-side.scatter(*holed[~holed_valid][:, 1:].T, s=60, marker="x", color=PALETTE[6], label="its points without depth")
-side.plot(*naive_centre[1:], "D", color=PALETTE[6], linestyle="", label="its centre, all points")
+side.scatter(*holed[~holed_valid][:, 1:].T, s=60, marker="x", color=RED, label="its points without depth")
+side.plot(*naive_centre[1:], "D", color=RED, linestyle="", label="its centre, all points")
 side.plot(*masked_centre[1:], "o", color="black", linestyle="", label="its centre, valid points")
 side.set(aspect="equal", xlabel="y [m]", ylabel="z [m]", xlim=(-0.5, 0.32), ylim=(-0.03, 0.66))
 side.annotate("the camera", eye[1:], (12, -4), textcoords="offset points", fontsize=9)

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from hind4sight_min import geometry
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, GREEN, ORANGE, RED, SKY
 from hind4sight_min.lab.se3nets import association_loss
 
 options = lesson.begin("02_rigid_motion")
@@ -61,7 +61,7 @@ print("1. A quarter turn about z takes (1, 0, 0) to", np.round(quarter @ [1, 0, 
 w = np.array([0, 0, 1.5 * np.pi])
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.9), layout="constrained", width_ratios=(1, 1.2))
 steps, lengths = (8, 24, 72), []
-for n, colour in zip(steps, (PALETTE[6], PALETTE[0], PALETTE[2])):
+for n, colour in zip(steps, (RED, ORANGE, GREEN)):
     path = [np.array([1.0, 0, 0])]
     for _ in range(n):
         path.append(path[-1] + cross_matrix(w / n) @ path[-1])
@@ -77,7 +77,7 @@ axes[0].legend(fontsize=9)
 counts = np.unique(np.logspace(0.5, 4, 15).astype(int))
 powers = [np.linalg.matrix_power(np.eye(3) + cross_matrix(w / n), n) for n in counts]
 errors = [np.abs(power - geometry.so3_exp(w)).max() for power in powers]
-axes[1].loglog(counts, errors, "o-", color=PALETTE[5])
+axes[1].loglog(counts, errors, "o-", color=BLUE)
 axes[1].set(xlabel="number n of small steps", ylabel="largest error of a matrix entry")
 axes[1].set_title("$(I + [w]_\\times / n)^n$ against so3_exp", fontsize=11)
 axes[1].grid(alpha=0.3)
@@ -140,7 +140,7 @@ print(f"3. Poke {ROW}: {len(movers)} objects move and turn by {', '.join(f'{a:.0
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.3), layout="constrained", width_ratios=(1, 1, 1.1))
 axes[0].imshow(image)
 axes[0].set_title("the picture before the poke", fontsize=11)
-colours = [PALETTE[6], PALETTE[5]]
+colours = [RED, BLUE]
 tinted = 0.4 + 0.6 * image.mean(axis=-1, keepdims=True).repeat(3, axis=-1)
 for k, colour in enumerate(colours, 1):
     tinted[labels.reshape(tinted.shape[:2]) == movers[k - 1]] = colour
@@ -183,8 +183,8 @@ for panel, degrees in zip(axes, blend_angles):
     blended = geometry.transform_layer(square, half, geometry.so3_exp(twist), np.zeros((1, 2, 3)))
     shrink.append(np.linalg.norm(blended) / np.linalg.norm(square))
     for corners, colour, marker, size, label in ((square, "0.7", "s", 5, "before"),
-                                                 (turned, PALETTE[1], "x", 5, "mask 1: turned"),
-                                                 (blended, PALETTE[6], "o", 4, "mask 0.5: blended")):
+                                                 (turned, SKY, "x", 5, "mask 1: turned"),
+                                                 (blended, RED, "o", 4, "mask 0.5: blended")):
         panel.plot(*100 * corners[0, :, :2].T, marker, color=colour, markersize=size, label=label)
     panel.set(aspect="equal", xlabel="x [cm]")
     panel.set_title(f"turn by {degrees} degrees: shrinks to {shrink[-1]:.2f}", fontsize=11)
@@ -283,7 +283,7 @@ print(f"6. Squared error {squared_error(path[0]):.1f} cm^2 at zero, {found.fun:.
 print("   turns found:", *np.round(found_angles, 2), "degrees, true:", *np.round(true_angles, 2))
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.9), layout="constrained")
-for (name, values), colour in zip(gradient_errors.items(), (PALETTE[6], PALETTE[5])):
+for (name, values), colour in zip(gradient_errors.items(), (RED, BLUE)):
     left.loglog(small, values, color=colour, linewidth=2, label=name)
 left.set(xlabel="angle t [rad]", ylabel="relative error of the gradient")
 left.set_title("float32: as typed in, digits get lost; at zero it is NaN", fontsize=11)

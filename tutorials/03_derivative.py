@@ -25,7 +25,7 @@ from autograd import grad
 from autograd.extend import defvjp, primitive
 
 from hind4sight_min import ops
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, GREEN, ORANGE, RED
 
 options = lesson.begin("03_derivative")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -140,7 +140,7 @@ g, places = tests["hard"]
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.5), layout="constrained", width_ratios=(1.3, 1))
 for panel, which, title in ((axes[0], 0, "dL/dr, one bar group per pixel"), (axes[1], 1, "dL/dx, one per place")):
     count = len(measured["hard"][which])
-    for j, ((name, vjp), colour) in enumerate(zip(versions.items(), PALETTE[[2, 6, 0]])):
+    for j, ((name, vjp), colour) in enumerate(zip(versions.items(), (GREEN, RED, ORANGE))):
         panel.bar(np.arange(count) + 0.27 * (j - 1), vjp(g, row, places)[which], 0.27, color=colour, label=name)
     panel.hlines(measured["hard"][which], np.arange(count) - 0.42, np.arange(count) + 0.42, color="black", linewidth=2,
                  label="measured")
@@ -183,7 +183,7 @@ print(f"   at the kink x = 3: slope {left:.2f} to the left, {right:.2f} to the r
       f"{mean_slope:.2f}, VJP {read_vjp(np.ones(1), row, kink)[1][0]:.2f}")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-for (name, values), colour, style in zip(errors_of_step.items(), PALETTE[[0, 5, 6]], ("-.", "-", "--")):
+for (name, values), colour, style in zip(errors_of_step.items(), (ORANGE, BLUE, RED), ("-.", "-", "--")):
     axes[0].loglog(h, np.maximum(values, 1e-13), style, color=colour, linewidth=2, label=name)
 axes[0].set(xlabel="step h", ylabel="error of the slope", ylim=(1e-13, 10))
 axes[0].set_title("the slope of sin at 1: too small is as bad as too large", fontsize=11)
@@ -192,8 +192,8 @@ fine = np.linspace(0, 5.99, 300)
 axes[1].plot(fine, read(row, fine), color="0.4", label="y = read(r, x)")
 axes[1].plot(np.arange(6), row[:6], "o", color="black", label="pixels")
 away = np.array([-0.8, 0.8])
-for slope, colour, name in ((left, PALETTE[0], "slope to the left"), (right, PALETTE[6], "slope to the right"),
-                            (mean_slope, PALETTE[5], "central difference")):
+for slope, colour, name in ((left, ORANGE, "slope to the left"), (right, RED, "slope to the right"),
+                            (mean_slope, BLUE, "central difference")):
     axes[1].plot(3 + away, row[3] + slope * away, color=colour, linewidth=2, label=name)
 axes[1].set(xlabel="place x", ylabel="y", ylim=(0, 2))
 axes[1].set_title("a kink has no slope", fontsize=11)

@@ -30,7 +30,7 @@ from autograd import grad
 
 from hind4sight_min import losses, ops
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, GREEN, RED
 from hind4sight_min.lab.noise import add_depth_noise
 from hind4sight_min.training import scenes_of
 
@@ -135,10 +135,10 @@ print(f"3. Of the arrows on the object, {share:.0%} are within 60 degrees of its
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", sharex=True, sharey=True)
 x, y = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
-for panel, arrows, title, colour in ((left, pull / 4, "minus the gradient of Eq. (2), a quarter as long", PALETTE[5]),
-                                     (right, true_flow, "the true scene flow", PALETTE[6])):
+for panel, arrows, title, colour in ((left, pull / 4, "minus the gradient of Eq. (2), a quarter as long", BLUE),
+                                     (right, true_flow, "the true scene flow", RED)):
     panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P_t$", linewidths=0)
-    panel.scatter(*after[0, next_counted[0] & (after[0, :, 2] > 0.01), :2].T, s=16, marker="x", color=PALETTE[2],
+    panel.scatter(*after[0, next_counted[0] & (after[0, :, 2] > 0.01), :2].T, s=16, marker="x", color=GREEN,
                   label="second cloud $P_{t+1}$, objects and walls only", linewidths=1)
     panel.quiver(*before[0, on_object, :2].T, *arrows[on_object, :2].T, color=colour, angles="xy", scale_units="xy",
                  scale=1, width=0.005)
@@ -186,8 +186,8 @@ print(f"4. Lowest at {scales[clean.argmin()]:.1f} times the true motion without 
       f"with noise, which lifts the curve from {clean.min():.0f} to {noisy.min():.0f} cm^2")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
-for panel, values, title, colour in ((axes[0], clean, "no noise", PALETTE[5]),
-                                     (axes[1], noisy, "1 cm depth noise, mean of 5 draws", PALETTE[6])):
+for panel, values, title, colour in ((axes[0], clean, "no noise", BLUE),
+                                     (axes[1], noisy, "1 cm depth noise, mean of 5 draws", RED)):
     panel.plot(scales, values, "o-", color=colour, markersize=4)
     panel.axvline(1, color="0.5", linestyle=":", label="true motion")
     panel.set(xlabel="object moved by this many times its true motion", ylabel="Chamfer distance [cm$^2$]")

@@ -29,7 +29,7 @@ from scipy.ndimage import map_coordinates
 
 from hind4sight_min import geometry, losses
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE, colour_wheel, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, RED, colour_wheel, flow_to_rgb
 from hind4sight_min.training import scenes_of
 
 options = lesson.begin("05_warping")
@@ -164,7 +164,7 @@ textures = {"one soft bump": np.exp(-((u - 40) / 8.0) ** 2),
 tried = np.linspace(-4, 24, 225)  # multiples of 1/8 px
 profiles, lows = {}, {}
 figure, axes = plt.subplots(2, 2, figsize=(11, 4.6), layout="constrained", width_ratios=(1, 1.2), sharex="col")
-for (name, texture), (left, right), colour in zip(textures.items(), axes, (PALETTE[5], PALETTE[6])):
+for (name, texture), (left, right), colour in zip(textures.items(), axes, (BLUE, RED)):
     bumps = texture.astype(np.float32).reshape(1, 1, -1, 1)
     moved = np.roll(bumps, 10, axis=2)
     everywhere = np.ones((1, len(u)), bool)
@@ -235,7 +235,7 @@ for panel, i, title, label in ((axes[0], 0, "photometric loss, Eq. (3)", "loss")
     rim = 100 * np.concatenate([[2 * offsets[0] - offsets[1]], offsets, [2 * offsets[-1] - offsets[-2]]])
     panel.contour(rim, rim, np.pad(basins[i], 1).astype(float), levels=[0.5], colors="white", linewidths=2)
     panel.plot(0, 0, "+", color="white", markersize=12, markeredgewidth=2)
-    panel.plot(*100 * start[:2], "o", color=PALETTE[6], markeredgecolor="white", markersize=9)
+    panel.plot(*100 * start[:2], "o", color=RED, markeredgecolor="white", markersize=9)
     panel.annotate("no motion", 100 * start[:2], (8, 4), textcoords="offset points", color="white", fontsize=10)
     panel.set(xlabel="offset in x [cm]")
     panel.set_title(f"{title}: basin {shares[i]:.0%} of the offsets", fontsize=11)
@@ -270,8 +270,8 @@ for text, ring in (("5 mm", 1), ("5 cm", 7)):
     print(f"   {text} from the truth: {right_way[ring, 0]:.0%} photometric, {right_way[ring, 1]:.0%} Chamfer")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
-for i, name, colour, style in ((0, "photometric, Eq. (3)", PALETTE[6], "o-"),
-                               (1, "Chamfer, Eq. (2)", PALETTE[5], "s-")):
+for i, name, colour, style in ((0, "photometric, Eq. (3)", RED, "o-"),
+                               (1, "Chamfer, Eq. (2)", BLUE, "s-")):
     axes[0].plot(100 * radii, right_way[:, i], style, color=colour, label=name)
     axes[1].plot(100 * radii, strength[:, i], style, color=colour, label=name)
 axes[0].axhline(1 / 3, color="0.5", linestyle=":", label="a random direction")

@@ -30,7 +30,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from hind4sight_min import geometry, losses, training
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, GREEN, PINK, RED, flow_to_rgb
 
 options = lesson.begin("06_smoothness")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -192,11 +192,11 @@ for i in (0, usual):
           f"{prices[i, 2]:.1f}")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-for i, (name, colour, style) in enumerate((("true flow", "black", "o-"), ("spilled", PALETTE[6], "s-"),
-                                           ("with a hole", PALETTE[5], "^-"))):
+for i, (name, colour, style) in enumerate((("true flow", "black", "o-"), ("spilled", RED, "s-"),
+                                           ("with a hole", BLUE, "^-"))):
     axes[0].loglog(sharpnesses, prices[:, i], style, color=colour, label=name)
-axes[1].semilogx(sharpnesses, spill_ratio, "s-", color=PALETTE[6], label="spilled / true")
-axes[1].semilogx(sharpnesses, hole_ratio, "^-", color=PALETTE[5], label="with a hole / true")
+axes[1].semilogx(sharpnesses, spill_ratio, "s-", color=RED, label="spilled / true")
+axes[1].semilogx(sharpnesses, hole_ratio, "^-", color=BLUE, label="with a hole / true")
 for panel in axes:
     panel.axvline(losses.EDGE_SHARPNESS, color="0.5", linestyle=":", label="the package's 40")
     panel.set(xlabel="sharpness s in $e^{-s |\\nabla I_t|}$")
@@ -245,7 +245,7 @@ for panel, (title, flow) in zip(axes, (("start: spilled", poke.spilled()), ("edg
     panel.set(xticks=[], yticks=[])
     panel.set_title(title, fontsize=11)
 for (name, where), values in left_over.items():
-    axes[3].plot(values, "-" if where == "object" else "--", color=PALETTE[5 if name == "edge-aware" else 6],
+    axes[3].plot(values, "-" if where == "object" else "--", color=BLUE if name == "edge-aware" else RED,
                  label=f"{where}, {name}")
 axes[3].set(xlabel="step", ylabel="share of the true motion", ylim=(0, 1.05))
 axes[3].legend(fontsize=8)
@@ -301,10 +301,10 @@ factors = curves / curves[:, -1:]
 medians = np.median(factors, axis=0)  # (shares, terms)
 wins = float((factors[:, 0, 1] > factors[:, 0, 0]).mean())
 rise = (curves[:, 0] - curves[:, -1]).mean(axis=0)
-styles = {"chamfer": ("$L_{CD}$, Eq. (2)", PALETTE[5], "o-"),
-          "distance_smoothness": ("$L_{ds}$, Eq. (5)", PALETTE[6], "s-"),
-          "photometric": ("$L_{rec}$, Eq. (3)", PALETTE[2], "^-"),
-          "flow_smoothness": ("$L_{fs}$, Eq. (4)", PALETTE[3], "d-")}
+styles = {"chamfer": ("$L_{CD}$, Eq. (2)", BLUE, "o-"),
+          "distance_smoothness": ("$L_{ds}$, Eq. (5)", RED, "s-"),
+          "photometric": ("$L_{rec}$, Eq. (3)", GREEN, "^-"),
+          "flow_smoothness": ("$L_{fs}$, Eq. (4)", PINK, "d-")}
 print(f"6. What a hole does to each loss, {len(group)} pokes: median factor; mean rise times its weight in training")
 for i, key in enumerate(styles):
     print(f"   {key}: {medians[0, i]:.2f}; {training.WEIGHTS[key] * rise[i]:.2f}")
@@ -316,7 +316,7 @@ for i, (name, colour, style) in enumerate(styles.values()):
 axes[0].set(xlabel="how far the core moves [% of its true motion]", ylabel="loss / loss without a hole")
 axes[0].legend(fontsize=9)
 axes[0].set_title(f"as the hole closes, median of {len(group)} pokes", fontsize=11)
-axes[1].plot(*factors[:, 0, :2].T, "o", color=PALETTE[5], markersize=5, alpha=0.7)
+axes[1].plot(*factors[:, 0, :2].T, "o", color=BLUE, markersize=5, alpha=0.7)
 axes[1].axline((1, 1), slope=1, color="0.5", linestyle=":", label="the same factor")
 axes[1].set(xlabel="$L_{CD}$ with a hole / without", ylabel="$L_{ds}$ with a hole / without")
 axes[1].legend(fontsize=9)

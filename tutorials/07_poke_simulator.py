@@ -33,7 +33,7 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from hind4sight_min import interactions, scene
 from hind4sight_min.geometry import poke_frame, project, unproject
 from hind4sight_min.lab.evaluation import MOVING
-from hind4sight_min.lab.figures import OUTLINE, PALETTE
+from hind4sight_min.lab.figures import BLUE, ORANGE, OUTLINE, RED
 from hind4sight_min.lab.noise import add_depth_noise
 from hind4sight_min.sim.arena import Arena, Settings
 from hind4sight_min.sim.collection import collect_shard
@@ -154,7 +154,7 @@ for number, (panel, frame) in enumerate(zip(axes, film)):
     ends = number in (0, len(film) - 1)
     picture(panel, frame[part], ("before" if number == 0 else "after") if ends else "during the poke")
     for line in panel.spines.values():
-        line.set(color=PALETTE[6] if ends else "0.8", linewidth=4)
+        line.set(color=RED if ends else "0.8", linewidth=4)
 figure.suptitle("The finger (white cylinder) pushes and is lifted; the robot keeps the two framed pictures only"
                 if bullet else "All that the robot keeps of a poke: a picture before and one after", fontsize=11)
 lesson.keep(options, figure, "film")
@@ -218,8 +218,8 @@ print(f"4. Pokes that moved one object, by more than 1 cm: its motion is off the
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.9), layout="constrained", width_ratios=(1.15, 1.15, 0.8))
 for panel, tails, tips, title in ((axes[0], where[:, 0], there[:, 0], "in the arena's frame"),
                                   (axes[1], here_local, there_local, "in the poke's frame")):
-    for group, colour, label in ((first, PALETTE[5], "the only object that moved"),
-                                 (~first, PALETTE[0], "one of several")):
+    for group, colour, label in ((first, BLUE, "the only object that moved"),
+                                 (~first, ORANGE, "one of several")):
         panel.quiver(*tails[group, :2].T, *(tips - tails)[group, :2].T, color=colour, angles="xy", scale_units="xy",
                      scale=1, width=0.005, label=label if panel is axes[0] else None)
     panel.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
@@ -230,7 +230,7 @@ axes[1].plot(0, 0, "k+", markersize=14, markeredgewidth=2.5, zorder=5, label="th
 axes[1].legend(fontsize=8, loc="upper right")
 axes[0].legend(fontsize=8, loc="upper right")
 values, shares = np.unique(counts, return_counts=True)
-axes[2].bar(values, shares / len(counts), color=PALETTE[5], width=0.6)
+axes[2].bar(values, shares / len(counts), color=BLUE, width=0.6)
 axes[2].set(xlabel="objects that moved", ylabel="share of the pokes", xticks=values)
 axes[2].set_title("most pokes move one object", fontsize=11)
 figure.suptitle("The same motions twice: in the poke's frame nearly all point forwards", fontsize=11)

@@ -33,7 +33,7 @@ import numpy as np
 from hind4sight_min import geometry, networks, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE, blend, draw_arrow, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, blend, draw_arrow, flow_to_rgb
 from hind4sight_min.scene import Scene, look
 
 options = lesson.begin("08_forward_model")
@@ -179,7 +179,7 @@ for poke in range(4):
     axes[0, poke].set_title(f"masks, if the poke is {np.degrees(angles[poke]):.0f}\u00b0", fontsize=11)
     cloud, moves = scenes.points[poke], np.linalg.norm(scene_flow[poke], axis=1) > 0.002
     axes[1, poke].scatter(*cloud[cloud[:, 2] > 0.008, :2].T, color="0.6", s=7, linewidths=0)
-    axes[1, poke].quiver(*cloud[moves, :2].T, *scene_flow[poke, moves, :2].T, color=PALETTE[5], angles="xy",
+    axes[1, poke].quiver(*cloud[moves, :2].T, *scene_flow[poke, moves, :2].T, color=BLUE, angles="xy",
                          scale_units="xy", scale=1, width=0.008)
     axes[1, poke].set(aspect="equal", xlim=(-0.25, 0.25), ylim=(-0.18, 0.20), xlabel="x [m]")
 axes[1, 0].set_ylabel("y [m]")

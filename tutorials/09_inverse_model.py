@@ -33,7 +33,7 @@ from hind4sight_min import losses, networks, ops, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.interactions import cell_centres, cells_of, grid_shape
 from hind4sight_min.lab.evaluation import poke_errors, poke_from_heatmaps
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, GREEN, ORANGE, RED, SKY
 from hind4sight_min.scene import most_changed
 
 options = lesson.begin("09_inverse_model")
@@ -78,7 +78,7 @@ print(f"   shipped: target off by {100 * np.median(target_error):.1f} cm (median
 half = settings["arena"] / 2
 figure, axes = plt.subplots(1, 4, figsize=(11, 3.4), layout="constrained")
 counts = amount[ROW] > 1e-6 * amount[ROW].max()  # the others hardly changed at all
-for clouds, colour, label in zip(changed, (PALETTE[5], PALETTE[6]), ("before", "after")):
+for clouds, colour, label in zip(changed, (BLUE, RED), ("before", "after")):
     axes[0].scatter(*clouds[ROW, counts, :2].T, s=4 + 200 * amount[ROW, counts], color=colour, label=label,
                     linewidths=0)
 axes[0].legend(fontsize=8, loc="upper right")
@@ -89,7 +89,7 @@ for panel, name, which, title in ((axes[1], "fresh", 1, "fresh: target"), (axes[
     panel.imshow(map_, origin="lower", extent=(-half, half, -half, half), cmap="cividis", vmin=0,
                  vmax=max(map_.max(), 0.02), interpolation="nearest")
     panel.plot(*(data.pokes[ROW, :2] if which else data.starts[ROW]), "o", markersize=12, fillstyle="none",
-               color=PALETTE[6], markeredgewidth=2)
+               color=RED, markeredgewidth=2)
     panel.set_title(f"{title}, max {map_.max():.3f}", fontsize=11)
 for panel in axes:
     panel.set(aspect="equal", xlim=(-half, half), ylim=(-half, half), xlabel="x [m]", xticks=[-0.2, 0, 0.2],
@@ -160,14 +160,14 @@ for term, weight in training.WEIGHTS.items():
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
 for i, (step, norms) in enumerate(first.items()):
-    left.bar(np.arange(len(LAYERS)) + 0.27 * (i - 1), np.maximum(norms, 1e-4), 0.27, color=PALETTE[(1, 0, 5)[i]],
+    left.bar(np.arange(len(LAYERS)) + 0.27 * (i - 1), np.maximum(norms, 1e-4), 0.27, color=(SKY, ORANGE, BLUE)[i],
              label=f"after {step} step{'s' * (step != 1)}")
 left.set(yscale="log", ylim=(1e-4, 1e3), ylabel="norm of the Chamfer term's gradient")
 left.set_xticks(range(len(LAYERS)), LAYERS, rotation=40, ha="right")
 left.set_title("The first step reaches one layer only", fontsize=11)
 left.legend(fontsize=9, loc="upper left")
-for i, (label, colour) in enumerate((("value", PALETTE[2]), ("one poke's gradient", PALETTE[1]),
-                                     ("mean gradient", PALETTE[5]))):
+for i, (label, colour) in enumerate((("value", GREEN), ("one poke's gradient", SKY),
+                                     ("mean gradient", BLUE))):
     right.bar(np.arange(len(audit)) + 0.27 * (i - 1), [values[i] for values in audit.values()], 0.27, color=colour,
               label=label)
 right.set(yscale="log", ylim=(0.01, 3e3), ylabel="times the weight")

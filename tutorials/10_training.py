@@ -35,7 +35,7 @@ from hind4sight_min import losses, networks, ops, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import optical_flow, project
 from hind4sight_min.lab.evaluation import matched_iou, true_motion
-from hind4sight_min.lab.figures import PALETTE, TERMS, blend, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, GREEN, ORANGE, RED, SKY, TERMS, blend, flow_to_rgb
 from hind4sight_min.scene import crop, look
 
 options = lesson.begin("10_training")
@@ -99,7 +99,7 @@ print(f"   Adam's first step: {np.abs(ways['Adam'][1] - ways['Adam'][0])}, with 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained", width_ratios=(1.4, 1))
 x, y = np.meshgrid(np.linspace(-10, 3, 100), np.linspace(-1.5, 1.5, 60))
 axes[0].contour(x, y, valley((x, y))[0], levels=np.array([2, 20, 100, 400, 1000, 2000]), colors="0.8", linewidths=1)
-for (name, way), colour, style in zip(ways.items(), PALETTE[[6, 0, 5]], (".:", ".--", ".-")):
+for (name, way), colour, style in zip(ways.items(), (RED, ORANGE, BLUE), (".:", ".--", ".-")):
     axes[0].plot(*np.array(way).T, style, color=colour, markersize=4, linewidth=1, label=name)
     axes[1].semilogy(heights[name], style[1:], color=colour, linewidth=2, label=name)
 axes[0].plot(0, 0, "k+", markersize=12, markeredgewidth=2)
@@ -180,7 +180,7 @@ for noise, values in zip(NOISES, change):
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
 for panel in axes:
-    for noise, values, colour, style in zip(NOISES, change, (PALETTE[6], PALETTE[5]), ("s:", "o-")):
+    for noise, values, colour, style in zip(NOISES, change, (RED, BLUE), ("s:", "o-")):
         panel.plot(SHIFTS, values, style, color=colour, label=f"noise of SD {noise} on $I_t$")
     panel.axhline(0, color="0.5", linewidth=1)
     panel.axvline(0, color="0.5", linewidth=1)
@@ -294,21 +294,21 @@ for name, values in epochs.items():
 
 figure, axes = plt.subplots(3, 3, figsize=(11, 7.5), layout="constrained")
 for panel, (name, values) in zip(axes.flat, epochs.items()):
-    panel.plot(epoch_end, values, ".-", color=PALETTE[5])
+    panel.plot(epoch_end, values, ".-", color=BLUE)
     panel.axhline(level[name], color="0.5", linestyle=":")
     panel.set_title(f"{name.replace('_', ' ')}\n{TERMS[name]}", fontsize=10)
     panel.set_ylim(0, 1.1 * max(*values, level[name]))
 rate_panel, ratio_panel, masks_panel = axes[2]
-rate_panel.plot(steps, rates, color=PALETTE[6])
+rate_panel.plot(steps, rates, color=RED)
 rate_panel.set_title("learning rate", fontsize=10)
 rate_panel.set_ylim(0, None)
-ratio_panel.plot(step, ratio, ".-", color=PALETTE[5])
+ratio_panel.plot(step, ratio, ".-", color=BLUE)
 ratio_panel.axhline(1, color="0.5", linestyle=":")
 ratio_panel.set_title("held-out: squared flow error\n/ no motion", fontsize=10)
 ratio_panel.set_ylim(0, None)
-masks_panel.plot(step, on, ".-", color=PALETTE[6], label="cover, moving points")
-masks_panel.plot(step, off, ".-", color=PALETTE[1], label="cover, still points")
-masks_panel.plot(step, iou, ".-", color=PALETTE[2], label="IoU of the masks")
+masks_panel.plot(step, on, ".-", color=RED, label="cover, moving points")
+masks_panel.plot(step, off, ".-", color=SKY, label="cover, still points")
+masks_panel.plot(step, iou, ".-", color=GREEN, label="IoU of the masks")
 masks_panel.set_title("held-out: masks\n(no loss says where they shall be)", fontsize=10)
 masks_panel.set_ylim(0, 1.5)
 masks_panel.legend(fontsize=8, loc="upper center")
@@ -364,13 +364,13 @@ for i in range(len(drawn)):
     shown.append((panel_of(figure.add_subplot(grid[i, 1]), parts.images[i], "masks" if i == 0 else ""),
                   panel_of(figure.add_subplot(grid[i, 2]), parts.images[i], "optical flow" if i == 0 else "")))
 upper, lower = figure.add_subplot(grid[0, 3]), figure.add_subplot(grid[1, 3])
-upper.plot(epoch_end, 1e4 * np.array(epochs["chamfer"]), ".-", color=PALETTE[5])
+upper.plot(epoch_end, 1e4 * np.array(epochs["chamfer"]), ".-", color=BLUE)
 upper.set_title("Chamfer, training [cm$^2$]", fontsize=10)
 upper.set_ylim(0, None)
-lower.plot(step, iou, ".-", color=PALETTE[2])
+lower.plot(step, iou, ".-", color=GREEN)
 lower.set_title("IoU of the masks, held-out", fontsize=10)
 lower.set(xlabel="step", ylim=(0, 1))
-marks = [panel.axvline(0, color=PALETTE[6], linewidth=2) for panel in (upper, lower)]
+marks = [panel.axvline(0, color=RED, linewidth=2) for panel in (upper, lower)]
 heading = figure.suptitle("step 0", fontsize=11)
 figure.draw_without_rendering()
 figure.set_layout_engine("none")  # the layout of the first frame is that of all

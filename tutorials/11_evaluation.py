@@ -33,7 +33,7 @@ from hind4sight_min import training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.interactions import cell_centres
 from hind4sight_min.lab import evaluation, tables
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, RED, SKY
 from hind4sight_min.lab.image_pairs import evaluate_image_pairs
 from hind4sight_min.lab.noise import add_depth_noise, smooth_depth
 from hind4sight_min.networks import predict
@@ -116,17 +116,17 @@ for name, (over_moving, over_all) in optical.items():
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.7), layout="constrained", width_ratios=(1.1, 1.1, 1))
 axes[0].plot([0.05, 12], [0.05, 12], color="0.5", linestyle=":", label="no motion")
-axes[0].scatter(*rms, s=14, color=PALETTE[5], label="a poke")
+axes[0].scatter(*rms, s=14, color=BLUE, label="a poke")
 axes[0].set(xscale="log", yscale="log", xlabel="true motion, RMS [cm]", ylabel="error, RMS [cm]", xlim=(0.05, 12),
             ylim=(0.05, 12))
 axes[0].set_title("error against motion, moving points", fontsize=11)
 axes[0].legend(fontsize=9, loc="upper left")
-for error, colour, label in ((target_error, PALETTE[5], "inverse model"), (chance_error, "0.5", "chance")):
+for error, colour, label in ((target_error, BLUE, "inverse model"), (chance_error, "0.5", "chance")):
     axes[1].plot(100 * np.sort(error), np.linspace(0, 1, len(error)), color=colour, label=label)
 axes[1].set(xlabel="target error at most [cm]", ylabel="share of the pokes", xlim=(0, 40), ylim=(0, 1))
 axes[1].set_title("which poke was it?", fontsize=11)
 axes[1].legend(fontsize=9, loc="lower right")
-for i, (label, colour) in enumerate((("moving points", PALETTE[5]), ("all points", PALETTE[1]))):
+for i, (label, colour) in enumerate((("moving points", BLUE), ("all points", SKY))):
     axes[2].bar(np.arange(4) + 0.4 * i - 0.2, [each[i] for each in optical.values()], 0.4, color=colour, label=label)
 axes[2].set(yscale="log", ylabel="end-point error [px]")
 axes[2].set_xticks(range(4), optical, rotation=30)
@@ -166,7 +166,7 @@ for panel, name, baseline, title in (
         (axes[1], "mask_iou", None, "IoU of the masks"),
         (axes[2], "inverse_target_cm", metrics["inverse_target_chance_cm"], "median target error [cm]"),
         (axes[3], "inverse_direction_deg", 90, "median direction error [deg]")):
-    panel.plot(100 * np.array(LEVELS), [each[name] for each in noisy], "o-", color=PALETTE[6])
+    panel.plot(100 * np.array(LEVELS), [each[name] for each in noisy], "o-", color=RED)
     if baseline:
         panel.axhline(baseline, color="0.5", linestyle=":", label="no motion" if baseline == 1 else "chance")
         panel.legend(fontsize=9, loc="upper left")
@@ -205,13 +205,13 @@ for panel, name, title, top in ((axes[0], "flow_mse_ratio", "squared flow error 
                                 (axes[1], "mask_iou", "IoU of the masks", 1.0),
                                 (axes[2], "inverse_target_cm", "median target error [cm]", 40)):
     for (model, seed), found in small.items():
-        panel.plot(places[model], found[name], "o", color=PALETTE[(5, 6)[seed]], markersize=9)
+        panel.plot(places[model], found[name], "o", color=(BLUE, RED)[seed], markersize=9)
     panel.axhline(metrics[name], color="black", linestyle="--", linewidth=1)
     panel.set_xticks(list(places.values()), [tables.MODELS[model][0] for model in places])
     panel.set(ylim=(0, top), xlim=(-0.5, 2.5))
     panel.set_title(title, fontsize=11)
 for seed in SEEDS:
-    axes[1].plot([], [], "o", color=PALETTE[(5, 6)[seed]], label=f"seed {seed}")
+    axes[1].plot([], [], "o", color=(BLUE, RED)[seed], label=f"seed {seed}")
 axes[1].plot([], [], "k--", linewidth=1, label="shipped model")
 axes[1].legend(fontsize=9, loc="center left")
 figure.suptitle(f"After {STEPS} steps: 2D alone has hardly begun; 3D and full are far from what they can be",

@@ -30,7 +30,7 @@ from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import project
 from hind4sight_min.lab import control, figures
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import PALETTE
+from hind4sight_min.lab.figures import BLUE, PINK, RED, YELLOW
 from hind4sight_min.lab.marks import points_at
 
 options = lesson.begin("12_planning")
@@ -99,7 +99,7 @@ print(f"2. Of {len(angles)} directions {possible.sum()} leave room for the finge
       + " and ".join(f"{np.degrees(angles[cost.argmin()]):.0f} degrees ({name})" for name, cost in terms.items()))
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
-for panel, (name, cost), colour in zip(axes, terms.items(), (PALETTE[5], PALETTE[6])):
+for panel, (name, cost), colour in zip(axes, terms.items(), (BLUE, RED)):
     panel.plot(np.degrees(angles), cost, color=colour)
     panel.plot(np.degrees(angles[~possible]), cost[~possible], "x", color="0.5", label="no room for the finger")
     panel.set(xlabel="direction of the poke [degrees]", ylabel=name, xticks=range(-180, 181, 60))
@@ -142,8 +142,8 @@ for i, (panel, (ends, costs)) in enumerate(zip(axes, rounds)):
     possible = [j for j in np.argsort(costs)[::-1] if np.isfinite(costs[j])]  # the dearest first
     figures.show_image(panel, 0.45 + 0.5 * rgb.mean(axis=2) / 255, f"Round {i + 1}: {len(possible)} of {len(costs)} "
                        f"possible\nlowest cost {costs.min():.2f}", cmap="gray", vmin=0, vmax=1)
-    panel.plot(*marks.T, "o", markersize=9, fillstyle="none", color=PALETTE[4], markeredgewidth=2)
-    panel.plot(*goal.pixels.T, "*", markersize=11, color=PALETTE[4], markeredgecolor="black")
+    panel.plot(*marks.T, "o", markersize=9, fillstyle="none", color=YELLOW, markeredgewidth=2)
+    panel.plot(*goal.pixels.T, "*", markersize=11, color=YELLOW, markeredgecolor="black")
     for j in possible:
         colour = plt.get_cmap("cividis")(1 - np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1))
         panel.plot(*ends[j].T, color=colour, linewidth=1.2)
@@ -158,9 +158,10 @@ lesson.keep(options, figure, "population")
 # ## The closed loop
 #
 # The world does not do quite what the model says. So only the first poke is carried out; then the robot looks again
-# and plans anew, until the goal is reached, no poke is predicted to help, or the pokes are spent. Between two pictures
-# it must find the marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's
-# mask and corrects it by registering the two pictures.
+# and plans anew, until no poke is predicted to help or the pokes are spent. Between two pictures it must find the
+# marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's mask and corrects
+# it by registering the two pictures. Pokes under which something would pass through something else are ruled out
+# (`lab.control.careful`): what a pushed object meets next, the model sees less well.
 
 # %%
 if simulator:
@@ -175,13 +176,13 @@ if simulator:
     figure, (first, second) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
     first.imshow(record["rgb"][-1])
     first.set_title("after the last poke: mark (ring) and its goal (star)", fontsize=11)
-    first.plot(*project(record["marks"][-1], camera).T, "o", markersize=12, fillstyle="none", color=PALETTE[4],
+    first.plot(*project(record["marks"][-1], camera).T, "o", markersize=12, fillstyle="none", color=YELLOW,
                markeredgewidth=2)
-    first.plot(*record["goal_marks"].T, "*", markersize=12, color=PALETTE[4], markeredgecolor="black")
+    first.plot(*record["goal_marks"].T, "*", markersize=12, color=YELLOW, markeredgecolor="black")
     first.set_xticks([])
     first.set_yticks([])
-    second.plot(100 * left, "o-", color=PALETTE[5], label="planned with the learned model")
-    second.plot(100 * lost, "s:", color=PALETTE[3], label="random pokes")
+    second.plot(100 * left, "o-", color=BLUE, label="planned with the learned model")
+    second.plot(100 * lost, "s:", color=PINK, label="random pokes")
     second.set(xlabel="pokes", ylabel="distance to the goal [cm]", ylim=(0, None))
     second.legend(fontsize=9)
     figure.suptitle("The closed loop closes in on the goal; random pokes do not", fontsize=11)

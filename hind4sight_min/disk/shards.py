@@ -19,8 +19,9 @@ DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
 
 
 def counts_of(depth):
-    """Depth in m as it is stored, uint16."""
-    return np.clip(np.round(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+    """Depth in m as it is stored, uint16: 0, missing, for what does not fit."""
+    counts = np.round(depth / DEPTH_UNIT)
+    return np.where((counts > 0) & (counts <= 65535), counts, 0).astype(np.uint16)
 
 
 def stamp(interactions):

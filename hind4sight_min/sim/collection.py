@@ -1,6 +1,5 @@
 """Collection: shards of pokes, each in a Bullet world with its own seed. Paper: Sec. IV-A and IV-B."""
 from collections import Counter
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -45,7 +44,7 @@ def collect_shard(settings, seed, index, pokes, world=None):
     befores, afters, drawn, starts = zip(*kept)
     rgb_before, depth_before, labels, poses_before = map(np.stack, zip(*befores))
     rgb_after, depth_after, _, poses_after = map(np.stack, zip(*afters))
-    meta = plain({"seed": seed, "shard": index, "settings": asdict(settings), "counts": dict(counts)})
+    meta = plain({"seed": seed, "shard": index, "settings": settings.plain, "counts": dict(counts)})
     interactions = Interactions(rgb_before, rgb_after, depth_before, depth_after, np.stack(drawn), np.stack(starts),
                                 arena.empty_depth, arena.camera, meta)
     return interactions, Truth(labels, poses_before, poses_after)
@@ -85,7 +84,7 @@ def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None, pa
     folder, counts, jobs = Path(folder).absolute(), Counter(kept=0), {}
     for index, first in enumerate(range(0, pokes, SHARD_POKES)):
         jobs[folder / f"shard_{index:04d}.npz"] = index, min(SHARD_POKES, pokes - first)
-    there, made_of = find_shards(folder), plain({"seed": seed, "settings": asdict(settings)})
+    there, made_of = find_shards(folder), plain({"seed": seed, "settings": settings.plain})
     jobs_of_part = dict([*jobs.items()][part[0] - 1::part[1]])
     total = sum(size for _, size in jobs_of_part.values())
     for path in there:
