@@ -60,10 +60,7 @@ class Camera:
 
 
 def rigid(points, transform):
-    """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points.
-
-    Raises ValueError for what are no points; whole numbers become floating-point ones.
-    """
+    """R p + T: one (4, 4) transform of points (..., 3), in their dtype. Raises ValueError for what are no points."""
     points, = as_arrays("*3", points=points)
     matrix = transform.astype(points.dtype)
     return anp.matmul(points, matrix[:3, :3].T) + matrix[:3, 3]

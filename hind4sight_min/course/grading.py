@@ -117,7 +117,7 @@ def read_zip(path, name):
     except ValueError:
         raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, a password
-        raise ValueError(f"{path.name}: a damaged or locked zip file ({error})") from None
+        raise ValueError(f"{path.name}: a damaged or locked zip file ({sandbox.one_line(error)})") from None
     if len(content) > MOST_SOURCE:
         raise ValueError(f"{path.name}: {name} in it has more than {MOST_SOURCE >> 20} MB")
     return as_utf8(content), f"{path}: {found[-1].filename}"

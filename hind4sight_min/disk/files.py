@@ -219,4 +219,5 @@ def load_npz(path, format, most=MOST_BYTES):
     except (MemoryError, OtherFormat):
         raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, NumPy, JSON
-        raise ValueError(f"{path}: damaged or not one of our files ({error or type(error).__name__})") from None
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: damaged or not one of our files ({reason})") from None
