@@ -27,7 +27,7 @@ TINY_SCALE = Scale(train_pokes=7, test_pokes=7, steps=3, long_steps=4, seeds=(1,
 def small_world(monkeypatch):
     """Seven pokes of a block in place of simulated ones, and networks of a few units -> the folders asked for."""
     asked = []
-    monkeypatch.setattr(tables, "_data", lambda folder: asked.append(folder.name) or moved_blocks())
+    monkeypatch.setattr(tables, "_data", lambda folder, *_: asked.append(folder.name) or moved_blocks())
     full = tables.recipe_of
     monkeypatch.setattr(tables, "recipe_of", lambda *given: replace(full(*given), sizes=TINY.sizes, batch=4))
     return asked

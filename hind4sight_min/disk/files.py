@@ -102,7 +102,7 @@ def only_one(path):
                 file.write(this_process())
             break
         except FileExistsError:
-            process = lock.read_text(errors="replace")[:99]
+            process = " ".join(lock.read_text(errors="replace").split())[:99]
             if is_dead(process):
                 lock.unlink(missing_ok=True)
     else:
@@ -219,4 +219,5 @@ def load_npz(path, format, most=MOST_BYTES):
     except (MemoryError, OtherFormat):
         raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, NumPy, JSON
-        raise ValueError(f"{path}: damaged or not one of our files ({error or type(error).__name__})") from None
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: damaged or not one of our files ({reason})") from None

@@ -15,7 +15,7 @@ from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.recordings import save_recording
-from ..disk.shards import load_interactions, parts_of
+from ..disk.shards import load_interactions, parts_of, stream_interactions
 from ..networks import Sizes
 from ..sim.arena import MIDDLE, Settings
 from ..sim.bodies import read_urdfs
@@ -170,7 +170,7 @@ def run_train(args):
     from . import figures
     out = Path(args.out)
     check_output("out", out, ".npz")  # a folder of pokes without a checkpoint after it has another ending
-    interactions = load_interactions(args.data)
+    interactions = stream_interactions(args.data)
     given = {name: value for name, value in vars(args).items() if value is not None and name not in (
         "command", "function", "data", "out", "jobs", "json", "resume")}
     if args.resume and given:

@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 from .. import planning, training
 from ..disk import checkpoints
 from ..disk.files import plain, read_json, write_json
-from ..disk.shards import load_interactions
+from ..disk.shards import load_interactions, stream_interactions
 from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
 from ..sim.objects import HELD_OUT
@@ -136,8 +136,8 @@ def collect_data(out, scale, map=map, progress=None):
 
 
 @lru_cache(maxsize=2)
-def _data(folder):
-    return se3nets.Supervised(load_interactions(folder), load_truth(folder))
+def _data(folder, read=load_interactions):
+    return se3nets.Supervised(read(folder), load_truth(folder))
 
 
 # --- one cell ----------------------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ def run_cell(cell, out, scale, save_every=60.0):
     window = MODELS[cell.model][2]
 
     def compute():
-        data = _data(out / "train")
+        data = _data(out / "train", stream_interactions)
         run = checkpoints.load_run(path) if path.exists() else training.start_run(recipe, data.interactions)
         if run.recipe != recipe:
             raise ValueError(f"{path}: made with another recipe; remove it, or choose another --out")
