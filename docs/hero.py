@@ -23,14 +23,12 @@ from hind4sight_min.networks import predict
 from hind4sight_min.sim.arena import Arena
 from hind4sight_min.sim.truth import true_scene_flow
 
-import cv2  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 OUT = Path(__file__).resolve().parent / "hero.gif"
 WIDTH = 384  # px of a photograph; two stand side by side
-EVERY = 30  # steps of the simulator, an eighth of a second, from one picture of a film to the next
 SEEN = 0.05  # m, on average over the points that move: what is long enough to see
 CARD, INK, DIM = "#22272e", "#f0f3f6", "#adbac7"  # a card of its own, for light pages and dark ones
 COLOURS = 128
@@ -38,15 +36,18 @@ COLOURS = 128
 
 # --- what happens -------------------------------------------------------------------------------------------------
 
-def film_pokes(arena):
-    """From now on the arena keeps pictures of every poke -> a list that grows by a list of photographs a poke."""
+def film_pokes(arena, every):
+    """From now on the arena keeps pictures of its pokes -> a list that grows by a list of photographs a poke.
+
+    every: steps of the simulator, of 1/240 s, from one to the next.
+    """
     films, step, poke = [], arena._step, arena.poke
 
     def filmed_steps(count):
-        for _ in range(count // EVERY):
-            step(EVERY)
+        for _ in range(count // every):
+            step(every)
             films[-1].append(arena.photograph(width=WIDTH))
-        step(count % EVERY)
+        step(count % every)
 
     def filmed_poke(*where):
         films.append([])
@@ -76,7 +77,7 @@ def one_poke(run, seed):
             if moving.any() and np.linalg.norm(flow[moving], axis=1).mean() > SEEN:
                 break
         photograph, poses = arena.photograph(width=WIDTH), arena.poses()
-        films = film_pokes(arena)
+        films = film_pokes(arena, 10)
         arena.poke(*drawn)
         true = true_scene_flow(scene.points[0].reshape(*labels.shape, 3), labels, poses, arena.poses()).reshape(-1, 3)
         moved = np.linalg.norm(true, axis=1) > 0.001  # m
@@ -91,7 +92,7 @@ def planned(run, seed):
     """Three objects brought to their goals -> the record of the closed loop, photographs and films with it."""
     with control.random_task(seed, 3, settings=control.settings_for(run)) as task:
         arena = task.arena
-        films = film_pokes(arena)
+        films = film_pokes(arena, 30)
         record = control.closed_loop(task, run, "learned", planning.Search(), 10, seed)
         return {**control.photographed(record, task, WIDTH), "camera": arena.camera, "films": films}
 
@@ -140,8 +141,8 @@ def tell_poke(stage, found):
     arrow, small = on_table([start, target], camera), found["rgb"]
     points, flow, moving = (found[name] for name in ("points", "flow", "moving"))
     masks = found["masks"][:, 1:].reshape(camera.height, camera.width, -1)
-    large = [cv2.resize(each, before.shape[1::-1], interpolation=cv2.INTER_NEAREST) for each in np.moveaxis(masks, 2, 0)]
-    masked = blend(before / 255, np.stack(large, axis=2))
+    times = len(before) // camera.height  # a mask has the model's pixels, a photograph more
+    masked = blend(before / 255, masks.repeat(times, axis=0).repeat(times, axis=1))
     colours = PALETTE[found["masks"][moving, 1:].argmax(axis=1)]
     pixels = project(np.stack([points[moving], (points + flow)[moving]]), camera)  # (2, n, 2)
 
@@ -166,8 +167,8 @@ def tell_poke(stage, found):
                "Masks and motions come from one picture and the poke.", arrows)
     film = [*found["film"], found["after"]]
     for i, picture in enumerate(film):
-        share = np.clip(i / (len(film) - 4), 0, 1)
-        stage.show(0.12, (before, "predicted"), (picture, "what happens"), "The same push, imagined and real.",
+        share = min(i / (len(film) - 6), 1)  # the last pictures are of rest
+        stage.show(0.08, (before, "predicted"), (picture, "what happens"), "The same push, imagined and real.",
                    dots(share))
     stage.show(3.5, (found["after"], "the prediction, over what came"), (found["after"], "what came"),
                f"Off by {100 * found['error']:.1f} cm after a motion of {100 * found['motion']:.1f} cm.", dots(1))

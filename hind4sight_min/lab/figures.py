@@ -161,7 +161,7 @@ def _draw_losses(panels, answer):
     valid, next_valid = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     warped, in_view = warp_backward(after.images, answer.flow[None])
     show_image(panels["warped"], np.clip(warped[0], 0, 1),
-               "$\\hat I_t$: after, warped back along\nthe flow, should be before, Sec. III-C")
+               "$\\hat I_t$: $I_{t+1}$ warped back along the flow;\nideally $I_t$, Sec. III-C")
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
@@ -200,7 +200,7 @@ def _draw_pictures(panels, images, photographs, arrow):
     place = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5)}  # a photograph's axes too are the model's pixels
     whole = images if photographs is None else photographs
     for name, symbol, image, photograph in zip(("before", "after"), ("I_t", "I_{t+1}"), images, whole):
-        poke = " and the poke $u_t$" if name == "before" else ""
+        poke = ", and the poke $u_t$" if name == "before" else ""
         show_image(panels[f"photo_{name}"], photograph, f"{name.capitalize()}{poke}:\nwhat the camera sees", **place)
         show_image(panels[name], image, f"What the model gets: ${symbol}$,\n{width} x {height} pixels (framed part)")
     for name in ("photo_before", "before"):
