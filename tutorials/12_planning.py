@@ -158,9 +158,10 @@ lesson.keep(options, figure, "population")
 # ## The closed loop
 #
 # The world does not do quite what the model says. So only the first poke is carried out; then the robot looks again
-# and plans anew, until the goal is reached, no poke is predicted to help, or the pokes are spent. Between two pictures
-# it must find the marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's
-# mask and corrects it by registering the two pictures.
+# and plans anew, until no poke is predicted to help or the pokes are spent. Between two pictures it must find the
+# marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's mask and corrects
+# it by registering the two pictures. Pokes under which something would pass through something else are ruled out
+# (`lab.control.careful`): what a pushed object meets next, the model sees less well.
 
 # %%
 if simulator:

@@ -5,14 +5,17 @@ Image panels show pixels as they are, (0, 0) top left. Arena panels are seen fro
 up, so that the camera looks in from the lower edge. A panel's Axes carry their name as label.
 """
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
 from matplotlib.patheffects import Normal, withStroke
 
-from ..disk.files import whole_file
+from ..disk.files import check_output, whole_file
 from ..geometry import project
 from ..interactions import grid_shape
 from ..losses import distance_maps, seen_in_both, warp_backward
@@ -105,6 +108,45 @@ def on_table(places, camera):
     """Places (..., 2) m on the arena's plane -> pixels (..., 2). Not in the paper."""
     places = np.asarray(places, float)
     return project(np.concatenate([places, 0 * places[..., :1]], axis=-1), camera)
+
+
+def next_picture(image, flow, depth):
+    """The next picture as predicted: each of its pixels takes its colour from where it comes from in this one.
+
+    Not in the paper, which warps I_{t+1} back to compare (Sec. III-C); here the same `warp_backward` goes along the
+    reversed flow. Of points that land on one pixel the nearest counts. Where none lands something comes to sight that
+    nobody knows: it gets the colour that most of the picture has. image (H, W, 3) in [0, 1], flow (H, W, 2) px, depth
+    (H, W) m of the predicted points -> (H, W, 3) in [0, 1].
+    """
+    height, width = depth.shape
+    there = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + flow
+    far_first = np.argsort(-depth, axis=None)
+    moved = np.linalg.norm(flow, axis=-1) > 0.25  # px
+    back = np.full(flow.shape, np.nan, np.float32)
+    for corner in ((0, 0), (0, 1), (1, 0), (1, 1), None):  # all around, against gaps; then, above that, the nearest
+        cells = (np.rint(there) if corner is None else np.floor(there) + corner).astype(int)
+        lands = (cells >= 0).all(axis=-1) & (cells < [width, height]).all(axis=-1) & (moved | (corner is None))
+        order = far_first[lands.ravel()[far_first]]
+        columns, rows = cells.reshape(-1, 2)[order].T
+        back[rows, columns] = -flow.reshape(-1, 2)[order]
+    warped = np.clip(warp_backward(image[None], np.nan_to_num(back)[None])[0][0], 0, 1)
+    unknown = cv2.dilate(np.uint8(np.isnan(back[..., 0])), np.ones((3, 3), np.uint8)) > 0  # and the blurred rim
+    unknown &= ~(np.linalg.norm(back, axis=-1) > 0.25)
+    return np.where(unknown[..., None], np.median(image, axis=(0, 1)), warped)
+
+
+def arrow_lines(starts, ends):
+    """Arrows from starts to ends (n, 2) as polylines (n, 5, 2), which can be moved quickly. Not in the paper."""
+    back = 0.3 * (starts - ends)
+    aside = back[:, ::-1] * [0.5, -0.5]
+    return np.stack([starts, ends, ends + back + aside, ends, ends + back - aside], axis=1)
+
+
+def scene_flow_lines(points, flow, valid):
+    """Some of the points (N, 3) m that move, as arrows seen from above: polylines (n, 5, 2). Not in the paper."""
+    moving = np.flatnonzero(valid & (np.linalg.norm(flow, axis=1) > MOVING))
+    moving = moving[::len(moving) // 16 + 1]
+    return arrow_lines(points[moving, :2], (points + flow)[moving, :2])
 
 
 BELOW, ARENA = {"location": "bottom", "shrink": 0.8}, {"xlabel": "x [m]", "ylabel": "y [m]"}
@@ -296,6 +338,71 @@ def training_figure(log, no_motion={}):
     return figure
 
 
+# --- the explorer -------------------------------------------------------------------------------------------------
+
+EXPLORER = [["camera", "camera", "masks", "above"], ["camera", "camera", "flow", "above"],
+            ["seen", "predicted", "truth", "distance"]]
+TITLES = {"camera": "Click where the finger shall stop, drag the way it pushes",
+          "masks": "Masks: what moves as one", "flow": "Optical flow: where each pixel goes",
+          "above": "Scene flow: where the points go, from above", "seen": "What the model sees: {} x {} pixels",
+          "predicted": "Predicted: these pixels, warped along the flow", "truth": "What really happened, after poke!",
+          "distance": "From predicted points to seen ones (Eq. 2)"}
+SHOWN = 0.08  # m; so much flow has the full colour
+BLANK = "0.93"  # grey
+
+
+def explorer_panels(figure, camera, settings, buttons):
+    """What the explorer draws on an empty figure -> a namespace of its artists. Not in the paper.
+
+    live: those that follow the mouse, which are drawn by hand, in this order. axes, images: by the names in EXPLORER;
+    image coordinates are pixels of the model's picture, whatever picture is shown. buttons: {key: text}.
+    """
+    width, height, half = camera.width, camera.height, 0.53 * settings["arena"]
+    axes = figure.subplot_mosaic(EXPLORER, gridspec_kw={"left": 0.01, "right": 0.945, "top": 0.965, "bottom": 0.14,
+                                                        "wspace": 0.06, "hspace": 0.17})
+    images = {name: show_image(axes[name], np.full((height, width), np.nan), "", vmin=0, vmax=3,  # cm
+                               extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+                               cmap=colormaps[DISTANCES].with_extremes(bad=BLANK)) for name in axes if name != "above"}
+    for name, title in TITLES.items():
+        axes[name].set_title(title.format(width, height), fontsize=9.5)
+        axes[name].spines[:].set_visible(name == "above")
+    bar = axes["distance"].inset_axes((0.1, -0.09, 0.6, 0.05))
+    figure.colorbar(images["distance"], cax=bar, orientation="horizontal").set_label("cm", loc="right")
+    above, view = axes["above"], axes["camera"]
+    above.set(aspect="equal", anchor="N", xlim=(-half, half), ylim=(-half, half), **ARENA)
+    above.yaxis.tick_right()
+    above.yaxis.set_label_position("right")
+    wheel = above.inset_axes((0.76, -0.38, 0.22, 0.22))
+    wheel.imshow(colour_wheel(96))
+    wheel.axis("off")
+    above.text(0.74, -0.35, f"optical flow, rim: {SHOWN / camera.pixel_size:.0f} px", fontsize=8.5, ha="right",
+               transform=above.transAxes)
+
+    def lines(axes, colour, width, label=None):
+        axes.plot([], [], color=colour, label=label)
+        return axes.add_collection(LineCollection([], colors=[colour], linewidths=width))
+    art = SimpleNamespace(
+        axes=axes, images=images, points=above.scatter([], [], s=9, linewidths=0),
+        true=lines(above, TRUE, 2.6, "true, after poke!"),
+        predicted=lines(above, PREDICTED, 1.1, "predicted"),
+        others=lines(view, "white", 0.8), elites=lines(view, GOAL, 1.6),
+        arrows=[draw_arrow(each, (0, 0), (1, 1)) for each in (view, axes["seen"], above)],
+        ways=view.plot([], [], ":", color=GOAL, linewidth=1.5, path_effects=OUTLINE)[0],
+        rings=view.plot([], [], "o", color=GOAL, markersize=11, fillstyle="none", markeredgewidth=2,
+                        path_effects=OUTLINE)[0],
+        stars=view.plot([], [], "*", color=GOAL, markersize=13, markeredgecolor="black")[0],
+        text=figure.text(0.012, 0.068, "", fontsize=10.5),
+        buttons={key: figure.text(0.02 + 0.125 * i, 0.022, text, bbox={"boxstyle": "round", "facecolor": BLANK,
+                                                                       "edgecolor": "0.5"})
+                 for i, (key, text) in enumerate(buttons.items())})
+    above.legend(loc="upper left", bbox_to_anchor=(0, -0.14), fontsize=8.5, frameon=False)
+    art.live = [*(images[name] for name in ("masks", "flow", "predicted")), art.predicted, art.others, art.elites,
+                *art.arrows, art.ways, art.rings, art.stars, art.text]
+    for artist in art.live:
+        artist.set_animated(True)
+    return art
+
+
 # --- planning -----------------------------------------------------------------------------------------------------
 
 def save_sequence(path, record, camera):
@@ -338,6 +445,24 @@ def _draw_marks(axes, record, t, camera):
     if t < len(record["pokes"]) and np.isfinite(record["starts"][t]).all():
         draw_arrow(axes, *on_table([record["starts"][t], record["pokes"][t, :2]], camera))
     axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
+
+
+def save_film(path, frames, seconds):
+    """Write pictures (H, W, 3) uint8 as a GIF that goes on for ever, whole or not at all. Not in the paper.
+
+    One palette for all: what is frequent, and what is rare but of its own colour. seconds: how long each is shown.
+    Raises ValueError for a path that does not end in .gif.
+    """
+    from PIL import Image
+    check_output("path", path, ".gif")
+    some = Image.fromarray(np.concatenate(frames[::len(frames) // 8 + 1])[::2, ::2])
+    frequent, rare = (some.quantize(count, method).getpalette() for count, method in (
+        (192, Image.Quantize.MEDIANCUT), (64, Image.Quantize.MAXCOVERAGE)))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(frequent[:3 * 192] + rare[:3 * 64])
+    first, *others = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    with whole_file(path) as temporary:
+        first.save(temporary, save_all=True, append_images=others, duration=round(1000 * seconds), loop=0)
 
 
 STYLES = {"learned": ("learned model, mean", PREDICTED, "-"),

@@ -24,17 +24,23 @@ def points_at(pixels, scene, camera):
     return np.array(found, np.float32)
 
 
+def at_height(pixels, heights, camera):
+    """Where, (M, 2) m, the rays through pixels (M, 2) are at these heights (M,) m. Not in the paper."""
+    pose = camera.arena_from_camera
+    rays = np.column_stack([(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(pixels))])
+    rays = rays @ pose[:3, :3].T
+    return pose[:2, 3] + rays[:, :2] * ((heights - pose[2, 3]) / rays[:, 2])[:, None]
+
+
 def places_at(pixels, heights, camera, settings):
     """Where on the arena, (M, 2) m, something of these heights (M,) m is that the camera sees at pixels (M, 2).
 
     Raises ValueError where that is outside the picture or the walls: a goal there cannot be met.
     """
-    pixels, pose = np.asarray(pixels, float), camera.arena_from_camera
+    pixels = np.asarray(pixels, float)
     if pixels.shape != (len(heights), 2) or not np.isfinite(pixels).all():
         raise ValueError(f"goals: expected ({len(heights)}, 2) finite pixels, one per mark, got shape {pixels.shape}")
-    rays = np.column_stack([(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(pixels))])
-    rays = rays @ pose[:3, :3].T
-    places = pose[:2, 3] + rays[:, :2] * ((heights - pose[2, 3]) / rays[:, 2])[:, None]
+    places = at_height(pixels, heights, camera)
     for (x, y), place in zip(pixels, places):
         if not (0 <= x <= camera.width - 1 and 0 <= y <= camera.height - 1):
             raise ValueError(f"goals: ({x:g}, {y:g}) lies outside the {camera.width} x {camera.height} picture")
