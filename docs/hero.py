@@ -28,7 +28,8 @@ from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 OUT = Path(__file__).resolve().parent / "hero.gif"
-WIDTH = 384  # px of a photograph; two stand side by side
+WIDTH, HEIGHT = 384, 288  # px of a photograph; two stand side by side, pixel by pixel
+CANVAS = 800, 370  # px
 SEEN = 0.05  # m, on average over the points that move: what is long enough to see
 CARD, INK, DIM = "#22272e", "#f0f3f6", "#adbac7"  # a card of its own, for light pages and dark ones
 COLOURS = 128
@@ -102,8 +103,9 @@ def planned(run, seed):
 class Stage:
     """Two pictures side by side on a card, each with a line above it, and one below both; frames are kept."""
 
-    def __init__(self):
-        self.figure = Figure(figsize=(8.0, 3.7), dpi=100, facecolor=CARD)
+    def __init__(self, width, height):  # of the model's pictures, px, in which everything is drawn
+        self.view = -0.5, width - 0.5, height - 0.5, -0.5
+        self.figure = Figure(figsize=np.array(CANVAS) / 100, dpi=100, facecolor=CARD)
         self.canvas, self.frames, self.seconds = FigureCanvasAgg(self.figure), [], []
 
     def show(self, seconds, left, right, caption, draw=None):
@@ -111,9 +113,10 @@ class Stage:
         self.figure.clear()
         both = []
         for i, (picture, title) in enumerate((left, right)):
-            axes = self.figure.add_axes((0.0125 + 0.4975 * i, 0.115, 0.4775, 0.775))
-            axes.imshow(picture, interpolation="nearest", extent=(-0.5, 63.5, 47.5, -0.5), aspect="auto")
-            axes.set(xlim=(-0.5, 63.5), ylim=(47.5, -0.5))
+            x, (wide, high) = (CANVAS[0] - 10 - WIDTH if i else 10), CANVAS
+            axes = self.figure.add_axes((x / wide, 42 / high, WIDTH / wide, HEIGHT / high))
+            axes.imshow(picture, interpolation="nearest", extent=self.view, aspect="auto")
+            axes.set(xlim=self.view[:2], ylim=self.view[2:])
             axes.axis("off")
             axes.set_title(title, color=INK, fontsize=12)
             both.append(axes)
@@ -151,8 +154,9 @@ def tell_poke(stage, found):
             draw_arrow(axes, *arrow)
 
     def arrows(axes, other):
-        axes.quiver(*pixels[0].T, *(pixels[1] - pixels[0]).T, color="black", angles="xy", scale_units="xy", scale=1,
-                    width=0.004)
+        some = (np.rint(pixels[0]) % 3 == 1).all(axis=1)  # every third pixel each way: the masks stay visible
+        axes.quiver(*pixels[0, some].T, *(pixels[1] - pixels[0])[some].T, color="black", angles="xy",
+                    scale_units="xy", scale=1, width=0.005)
         poke(other)
 
     def dots(share):
@@ -160,11 +164,12 @@ def tell_poke(stage, found):
             axes.scatter(*(pixels[0] + share * (pixels[1] - pixels[0])).T, c=colours, s=16, edgecolors="black",
                          linewidths=0.4)
         return draw
-    seen = (before, "what the camera sees"), (small, "what the model gets: 64 x 48, with depth")
+    gets = f"what the model gets: {camera.width} x {camera.height}, with depth"
+    seen = (before, "what the camera sees"), (small, gets)
     stage.show(2.5, *seen, "A robot pokes things to learn how they move. Nobody labels anything.")
     stage.show(2.0, *seen, "It is about to push along the arrow. What will move, and where to?", poke)
-    stage.show(3.0, (masked, "predicted: what moves (colour), and how (arrows)"), (before, "before"),
-               "Masks and motions come from one picture and the poke.", arrows)
+    stage.show(3.0, (masked, "predicted: masks (colour), motion (arrows)"), (before, "before"),
+               "The model says what moves as one, and where to, from one picture and the poke.", arrows)
     film = [*found["film"], found["after"]]
     for i, picture in enumerate(film):
         share = min(i / (len(film) - 6), 1)  # the last pictures are of rest
@@ -211,7 +216,8 @@ def main():
     parser.add_argument("--out", type=Path, default=OUT, help="a .gif (docs/hero.gif)")
     args = parser.parse_args()
     check_output("--out", args.out, ".gif")
-    run, stage = checkpoints.load_run(args.checkpoint), Stage()
+    run = checkpoints.load_run(args.checkpoint)
+    stage = Stage(run.meta["camera"]["width"], run.meta["camera"]["height"])
     tell_poke(stage, one_poke(run, args.seed))
     tell_plan(stage, planned(run, args.seed))
     stage.save(args.out)

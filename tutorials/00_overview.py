@@ -142,7 +142,7 @@ axes[1, 2].scatter(*before.points[0, :, :2].T, s=5, c=before.images.reshape(-1, 
 axes[1, 2].quiver(*before.points[0, moves, :2].T, *scene_flow[0, moves, :2].T, color=RED, angles="xy",
                   scale_units="xy", scale=1, width=0.008)
 axes[1, 2].set(aspect="equal", xlim=(-0.27, 0.27), ylim=(-0.26, 0.16), xticks=[], yticks=[])
-axes[1, 2].set_title("from above: $P_t$, and how far to $P'_{t+1}$", fontsize=11)
+axes[1, 2].set_title("$P_t$ and $P'_{t+1}$ from above", fontsize=11)
 for panel, map_, name in zip(axes[:, 3], root, ("P' \\to P", "P \\to P'")):
     shown = show_image(panel, map_, f"$D_{{{name}}}$", vmax=max(1.0, *(each.max() for each in root)))
 figure.colorbar(shown, ax=axes[:, 3], label="$\\sqrt{D}$ [cm]", shrink=0.7)
