@@ -122,8 +122,8 @@ def test_holes_stay_holes_and_pull_nothing_nearer():
 
 
 def test_depth_that_no_shard_can_hold_is_missing():
-    for unit, expected in (0.001, [0.8] * 5 + [0.9, 6.5, 0, 0, 0]), (0.0025, [2] * 5 + [2.25, 0, 0, 0, 0]):
-        found = cameras.metres_of("depth.png", np.array([[800] * 5 + [900, 6500, 6501, 65535, 0]], np.uint16), unit)
+    for unit, expected in (0.001, [0.8] * 5 + [0.9, 6.4, 0, 0, 0]), (0.0025, [2] * 5 + [2.25, 0, 0, 0, 0]):
+        found = cameras.metres_of("depth.png", np.array([[800] * 5 + [900, 6400, 6501, 65535, 0]], np.uint16), unit)
         np.testing.assert_allclose(found, [expected], rtol=1e-6)
     np.testing.assert_array_equal(counts_of(np.array([-0.1, 1e10, np.inf, np.nan, 6.6, 0.8])), [0, 0, 0, 0, 0, 8000])
 
@@ -308,7 +308,7 @@ DEPTH = np.full((HEIGHT, WIDTH), 800, np.uint16)
     (text("pokes.csv", ", 0, ", ", x, "), "pokes.csv: line 2: expected a name and five numbers"),
     (text("pokes.csv", ", 0, ", ", nan, "), "expected its direction"),
     (text("pokes.csv", ", 0, ", ", 30, "), "0.000 rad, got 30"),
-    (text("pokes.csv", "\n0, ", "\n1, 300, 0, 0, 1e300, 0\n0, "), "poke 1: expected a start and a target in the arena"),
+    (text("pokes.csv", "\n0, ", "\n1, 300, 0, 0, 1e300, 0\n0, "), "poke 1: expected start and target within 0.5 m"),
     (text("pokes.csv", "\n0,", "\n../0,"), "line 2: expected a name of its own"),
     (text("pokes.csv", "\n", "\n0, 0, 0, 0, -0.1, 0\n0, 0, 0, 0, -0.1, 0\n"), "line 3: expected a name of its own")])
 def test_a_recording_that_cannot_be_is_refused_by_its_file_and_field(spoil, said, tmp_path, capfd):

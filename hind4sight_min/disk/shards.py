@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import Camera
-from ..interactions import PER_POKE, Interactions
+from ..interactions import MOST_DEPTH, PER_POKE, Interactions
 from .files import load_npz, plain, save_npz
 
 FORMAT = "hind4sight_min interactions 1"
@@ -21,7 +21,7 @@ DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
 def counts_of(depth):
     """Depth in m as it is stored, uint16: 0, missing, for what does not fit."""
     counts = np.round(depth / DEPTH_UNIT)
-    return np.where((counts > 0) & (counts <= 65535), counts, 0).astype(np.uint16)
+    return np.where((counts > 0) & (counts <= MOST_DEPTH / DEPTH_UNIT), counts, 0).astype(np.uint16)
 
 
 def stamp(interactions):

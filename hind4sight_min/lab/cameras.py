@@ -139,7 +139,7 @@ def fit_plane(points, rng, tries=500):
     away = np.abs(some @ normals.T - np.sum(normals * corners[:, 0], axis=1))
     best = np.where(normals.any(axis=1), (away < FLAT).sum(axis=0), 0).argmax()
     normal, middle = normals[best], corners[best, 0]
-    for _ in range(5):
+    for _ in range(50):  # until nothing changes: after 5 it still depends on the draws
         inside = np.abs((points - middle) @ normal) < FLAT
         middle = points[inside].mean(axis=0)
         normal = np.linalg.eigh(np.cov(points[inside].T))[1][:, 0]
