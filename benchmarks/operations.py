@@ -162,10 +162,9 @@ def draw(path, operations, step):
             values = [operations.get(f"{what}_{label}_{name}_ms", np.nan) for label in sizes]
             axis.loglog(list(sizes.values()), values, color=colour, marker=marker, label=name.replace("_", " "))
         axis.set(title=title, xlabel=unit, ylabel="ms, value and gradient")
-        axis.legend(fontsize=7)
     n = np.array(POINTS, float)
     scale = operations["chamfer_10000_ours_ms"] / (1e4 * np.log(1e4))
-    axes[0].loglog(n, scale * n * np.log(n), ":", color="grey")
+    axes[0].loglog(n, scale * n * np.log(n), ":", color="grey", label="in proportion to N log N")
     batches = (4, 16, 64)
     for name, colour, marker, label in (("ours_1_process", SKY, "o", "ours, 1 process"),
                                         ("ours_2_processes", BLUE, "o", "ours, 2 processes"),
@@ -177,7 +176,8 @@ def draw(path, operations, step):
     axes[2].set_xticks(batches, labels=batches)
     axes[2].set_yticks([30, 100, 300], labels=[30, 100, 300])
     axes[2].minorticks_off()
-    axes[2].legend(fontsize=7)
+    for axis in axes:
+        axis.legend(fontsize=8)
     save_figure(figure, path)
 
 

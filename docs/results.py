@@ -170,6 +170,7 @@ HEADLINES = {
                       "<= 4000"),
     "explorer_lines": ("house", "explorer_lines", "lines of the explorer", "{:.0f}", "< 350"),
     "course_lines": ("house", "course_lines", "lines of the course", "{:.0f}", ""),
+    "hero_mb": ("house", "hero_mb", "README: megabytes of its animation", "{:.2f}", "< 3"),
     "test_lines": ("house", "test_lines", "lines of the tests, the course's apart", "{:.0f}", "<= 5000"),
 }
 FRONT = ("demo_flow_mse_ratio", "shipped_flow_mse_ratio", "shipped_mask_iou", "shipped_inverse_direction_deg",
@@ -275,12 +276,13 @@ def order_holds(figures, noise):
 
 
 def house():
-    """How large the house is, docstrings and all -> dict."""
+    """How large the house is, docstrings and all, and what its front page weighs -> dict."""
     def lines(*patterns):
         return float(sum(len(path.read_text().splitlines()) for pattern in patterns for path in ROOT.glob(pattern)
                          if path.name != "__main__.py" or "**" in pattern))
     course, of_course = lines("hind4sight_min/course/**/*.py"), lines("tests/*course*.py", "tests/test_grading.py")
     return {"core_lines": lines("hind4sight_min/[!_]*.py"), "course_lines": course,
+            "hero_mb": (ROOT / "docs" / "hero.gif").stat().st_size / 1e6,
             "explorer_lines": lines("hind4sight_min/lab/explore.py"),
             "package_lines": lines("hind4sight_min/**/*.py") - course, "test_lines": lines("tests/*.py") - of_course}
 

@@ -117,6 +117,25 @@ def test_a_page_points_to_functions_and_files_that_exist(page):
         assert ((ROOT / page).parent / path).exists(), path
 
 
+def pictures_of(text):
+    """[(what it says to those who cannot see it, path)] of a page's pictures, in Markdown or HTML."""
+    tags = re.findall(r"<(?:img|source)\b[^>]*>", text)
+    return re.findall(r"!\[([^\]]*)\]\(([^)\s]+)[^)]*\)", text) + [
+        tuple((re.search(rf'\b{name}="([^"]*)"', tag) or [""] * 2)[1] for name in ("alt", "src")) for tag in tags]
+
+
+PAGES = sorted(path.relative_to(ROOT) for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_every_picture_is_there_and_says_what_it_shows(page):
+    found = pictures_of((ROOT / page).read_text())
+    for text, path in found:
+        assert len(text.split()) > 2, f"{path}: a text of its own, for those who cannot see it"
+        assert ((ROOT / page).parent / path).is_file(), f"{path}: no such picture"
+    assert len({text for text, _ in found}) == len({path for _, path in found}), "two pictures say the same"
+
+
 def test_the_readme_s_python_finds_what_it_imports():
     code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
     compile(code, "README.md", "exec")

@@ -203,7 +203,7 @@ def _draw_losses(panels, answer):
     valid, next_valid = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     warped, in_view = warp_backward(after.images, answer.flow[None])
     show_image(panels["warped"], np.clip(warped[0], 0, 1),
-               "$\\hat I_t$: after, warped back along\nthe flow, should be before, Sec. III-C")
+               "$\\hat I_t$: $I_{t+1}$ warped back along the flow;\nideally $I_t$, Sec. III-C")
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
@@ -242,21 +242,24 @@ def _draw_pictures(panels, images, photographs, arrow):
     place = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5)}  # a photograph's axes too are the model's pixels
     whole = images if photographs is None else photographs
     for name, symbol, image, photograph in zip(("before", "after"), ("I_t", "I_{t+1}"), images, whole):
-        poke = " and the poke $u_t$" if name == "before" else ""
+        poke = ", and the poke $u_t$" if name == "before" else ""
         show_image(panels[f"photo_{name}"], photograph, f"{name.capitalize()}{poke}:\nwhat the camera sees", **place)
         show_image(panels[name], image, f"What the model gets: ${symbol}$,\n{width} x {height} pixels (framed part)")
     for name in ("photo_before", "before"):
         draw_arrow(panels[name], *arrow)
 
 
-def _zoom(panels, target, size):
-    """Show half of the picture, around the poke's target (2,) px, and frame that part in the whole ones."""
+def zoom(near, whole, target, size):
+    """Show half of the picture, around the poke's target (2,) px, and frame that part where the whole is shown.
+
+    Not in the paper. near, whole: Axes; size: (width, height) px of the model's picture.
+    """
     size = np.array(size)
     low = np.clip(target - size / 4, 0, size / 2) - 0.5
-    for name in set(NEAR_POKE) & set(panels):
-        panels[name].set(xlim=(low[0], low[0] + size[0] / 2), ylim=(low[1] + size[1] / 2, low[1]))
-    for name in WHOLE:
-        panels[name].add_patch(Rectangle(low, *(size / 2), fill=False, color="white", linewidth=1.5))
+    for axes in near:
+        axes.set(xlim=(low[0], low[0] + size[0] / 2), ylim=(low[1] + size[1] / 2, low[1]))
+    for axes in whole:
+        axes.add_patch(Rectangle(low, *(size / 2), fill=False, color="white", linewidth=1.5))
 
 
 def _draw_motion(panels, interactions, row, answer, truth):
@@ -299,7 +302,8 @@ def interaction_figure(interactions, row, answer, truth=None, photographs=None):
     _draw_pictures(panels, (answer.before.images[0], answer.after.images[0]), photographs, arrow)
     _draw_motion(panels, interactions, row, answer, truth)
     _draw_losses(panels, answer)
-    _zoom(panels, arrow[1], (camera.width, camera.height))
+    zoom([panels[name] for name in NEAR_POKE if name in panels], [panels[name] for name in WHOLE], arrow[1],
+         (camera.width, camera.height))
     for which, symbol, heatmap, place in zip(("start", "end"), "AB", answer.heatmaps, (start, poke[:2])):
         _draw_heatmap(panels[which], heatmap.reshape(grid_shape(interactions.settings)), place,
                       interactions.settings["arena"], which, symbol)
@@ -491,7 +495,7 @@ def control_figure(curves, pokes):
                  xticks=range(0, pokes + 1, 2))
         axes.grid(alpha=0.3, axis="y")
     figure.axes[0].set_ylabel("mean distance to the goals [cm]")
-    figure.axes[-1].legend(fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize=9)
     figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
     return figure
 
