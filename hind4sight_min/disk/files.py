@@ -212,7 +212,7 @@ def load_npz(path, format, most=MOST_BYTES):
             check_members(archive.zip, most)
             meta = dict(json.loads(str(archive["meta"])))
             if meta.get("format") != format:
-                raise OtherFormat(f"{path}: expected format {format!r}, got {str(meta.get('format'))[:99]!r}")
+                raise OtherFormat(f"{path}: expected format {format!r}, got {meta.get('format')!r:.99}")
             if archive.zip.testzip():  # NumPy reads as far as a header says, and then looks at no checksum
                 raise ValueError("a checksum differs")
             return {name: archive[name] for name in archive.files if name != "meta"}, meta
