@@ -69,7 +69,8 @@ def main():
             figures[f"{name}_bytes_per_poke"] = sum(path.stat().st_size for path in paths) / pokes
         less = trained(folder / "less", shards[:max(1, len(shards) // 10)], args.steps)
         more = trained(folder / "more", shards, args.steps)
-    figures.update(scale_pokes=pokes, train_peak_mb_tenth=less, train_peak_mb=more, train_memory_20k_over_2k=more / less)
+    figures.update(scale_pokes=pokes, train_peak_mb_tenth=less, train_peak_mb=more,
+                   train_memory_20k_over_2k=more / less)
     for name, value in figures.items():
         print(f"{name}: {value:.4g}")
     write_json(args.json, figures)

@@ -42,7 +42,8 @@ def distance_maps(predicted, observed, valid_predicted, valid_observed):
     The first lives on frame t's grid, the second on frame t+1's.
     """
     predicted, observed, valid_predicted, valid_observed = as_arrays(
-        "BND BMD BN BM", predicted=predicted, observed=observed, valid_predicted=valid_predicted, valid_observed=valid_observed)
+        "BND BMD BN BM", predicted=predicted, observed=observed, valid_predicted=valid_predicted,
+        valid_observed=valid_observed)
     return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
             nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
 

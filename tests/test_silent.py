@@ -247,12 +247,13 @@ def test_the_losses_refuse_what_numpy_would_let_pass(function, arguments, name):
 
 
 RNG = np.random.default_rng(0)
-BYTES, SEEN, POINTS = RNG.integers(0, 256, (B, H, W, 3), np.uint8), RNG.random((B, H * W)) < 0.7, RNG.random(CLOUD.shape)
+BYTES, POINTS = RNG.integers(0, 256, IMAGE.shape, np.uint8), RNG.random(CLOUD.shape)
+SEEN = RNG.random(MASK.shape) < 0.7
 
 
 @pytest.mark.parametrize("function, given, meant", [
     (losses.distance_maps, (POINTS, CLOUD, 255 * np.uint8(SEEN), np.int64(SEEN)), (POINTS, CLOUD, SEEN, SEEN)),
-    (losses.distance_maps, (POINTS.tolist(), CLOUD.astype(np.uint16), SEEN.tolist(), SEEN), (POINTS, CLOUD, SEEN, SEEN)),
+    (losses.distance_maps, (POINTS.tolist(), np.uint16(CLOUD), SEEN.tolist(), SEEN), (POINTS, CLOUD, SEEN, SEEN)),
     (losses.photometric_loss, (BYTES, BYTES[::-1], FLOW, SEEN), (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN)),
     (losses.photometric_loss, ((BYTES / 255).astype(">f8"), (BYTES[::-1] / 255).astype(">f8"), FLOW, SEEN),
      (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN))], ids=["masks", "lists", "bytes", "byte order"])

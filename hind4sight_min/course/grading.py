@@ -114,9 +114,9 @@ def read_zip(path, name):
                 raise ValueError(f"{path.name}: there is no {name} in it")
             with archive.open(found[-1]) as file:
                 content = file.read(MOST_SOURCE + 1)  # what the directory says of its size need not be true
-    except ValueError:
-        raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, a password
+        if type(error) is ValueError and str(error).startswith(path.name):
+            raise
         raise ValueError(f"{path.name}: a damaged or locked zip file ({sandbox.one_line(error)})") from None
     if len(content) > MOST_SOURCE:
         raise ValueError(f"{path.name}: {name} in it has more than {MOST_SOURCE >> 20} MB")

@@ -88,7 +88,7 @@ def clear_away(paths):
 
 @contextmanager
 def only_one(path):
-    """Within the block no other process works on `path`, a file of results: it would overwrite ours.
+    """Within the block no other process works on `path`, a file or a folder of results: it would overwrite ours.
 
     A lock file beside it names our process. That of a dead one is taken over, and what else dead ones left half written
     is removed. Raises ValueError naming the lock file where a process is at it.
@@ -108,7 +108,7 @@ def only_one(path):
     else:
         raise ValueError(f"{path}: process {process} is at work there; if it is not, remove {lock}")
     try:
-        clear_away(path.parent.glob(f".*.{path.stem}.*"))
+        clear_away([*path.parent.glob(f".*.{path.stem}.*"), *path.glob(".*.*")])
         yield
     finally:
         lock.unlink(missing_ok=True)
@@ -212,7 +212,7 @@ def load_npz(path, format, most=MOST_BYTES):
             check_members(archive.zip, most)
             meta = dict(json.loads(str(archive["meta"])))
             if meta.get("format") != format:
-                raise OtherFormat(f"{path}: expected format {format!r}, got {meta.get('format')!r}")
+                raise OtherFormat(f"{path}: expected format {format!r}, got {meta.get('format')!r:.99}")
             if archive.zip.testzip():  # NumPy reads as far as a header says, and then looks at no checksum
                 raise ValueError("a checksum differs")
             return {name: archive[name] for name in archive.files if name != "meta"}, meta

@@ -40,8 +40,9 @@ def stamp(interactions):
 def check_same_data(name, old, new):
     """Raise ValueError that says which entry differs unless two results of `stamp` are the same; None is not known."""
     for entry in new if old else ():
-        if old.get(entry) != plain(new[entry]):
-            raise ValueError(f"{name}: expected the data it was made with, of {entry} {old.get(entry)}, "
+        known = old.get(entry) if isinstance(old, dict) else old
+        if known != plain(new[entry]):
+            raise ValueError(f"{name}: expected the data it was made with, of {entry} {str(known)[:300]}, "
                              f"got {new[entry]}")
 
 
@@ -66,7 +67,7 @@ def load_shard(path):
             arrays[name] = arrays[name].astype(np.float32) * np.float32(meta["units"]["depth"])
         return Interactions(**arrays, camera=camera, meta=meta)
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {str(error)[:300]}") from None
 
 
 def find_shards(folder):

@@ -433,7 +433,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         **OWN,
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--part": {"type": part_of, "metavar": "I/N", "default": (1, 1),
-                   "help": "the I-th of N that share the work, at once or not; without it, what is missing (default all)"},
+                   "help": "the I-th of N that share the work; without it, all that is missing (default)"},
         "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
     "import": (run_import, "make a folder of shards from a real camera's recording: see docs/own-data.md", {
         "folder": {"help": "of the recording: camera.json, pokes.csv and PNG pictures"},
