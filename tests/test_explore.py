@@ -68,6 +68,9 @@ def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorde
         target, tip = (project(np.append(place, explorer.scene.points[0, 64 * y + x, 2]), data.camera) for place in (
             explorer.poke[:2], explorer.poke[:2] + 0.05 * explore.direction(explorer.poke)))
         np.testing.assert_allclose(target, (x, y), atol=1e-2, err_msg="the target is what was clicked")
+        start, end = explorer.art.arrows[2]._posA_posB  # from above, m
+        np.testing.assert_allclose(end, explorer.poke[:2], err_msg="the arrow does not follow")
+        assert (end - start) @ explore.direction(explorer.poke) > 0.099, "it comes from 10 to 14 cm behind"
         assert (tip - target) @ [to_x - x, to_y - y] > 0.99 * 6 * np.linalg.norm(tip - target), "dragged another way?"
         assert np.abs(np.angle(np.exp(1j * (explorer.poke[2] - angle)))) < 0.5
     said = predict(run.params, run.recipe.sizes, scenes_of(data[[0]])[0], explorer.poke[None])
@@ -174,7 +177,7 @@ def test_an_error_in_a_student_s_code_is_a_line_under_the_pictures(tmp_path, mon
 def test_in_the_simulator_every_poke_can_be_tried_and_taken_back():
     explorer = opened(data=None, seed=1)
     x, y = on_object(explorer)
-    first = shown(explorer, "camera")
+    first, poses = shown(explorer, "camera"), explorer.world.arena.poses()
     assert first.shape[0] > 48, "people are shown the fine picture"
     for to_x in (x + 6, x - 6):  # the finger finds room on one side at least
         do(explorer, f"drag {x} {y} {to_x} {y}", "key space")
@@ -184,6 +187,7 @@ def test_in_the_simulator_every_poke_can_be_tried_and_taken_back():
     assert shown(explorer, "truth").shape == (48, 64, 3) and len(explorer.art.true.get_segments())
     do(explorer, "key u")
     np.testing.assert_array_equal(shown(explorer, "camera"), first)
+    np.testing.assert_allclose(explorer.world.arena.poses(), poses, atol=1e-6, err_msg="the picture alone went back")
     do(explorer, "key n")
     assert (shown(explorer, "camera") != first).any() and not explorer.world.history
     explorer.world.arena.__exit__()
