@@ -56,9 +56,9 @@ def recorded():
     return load_run(data_small() / "checkpoint.npz"), data, truth, scenes_of_pokes(truth)
 
 
-def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorded):
+def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorded, tmp_path):
     run, data, _, _ = recorded
-    explorer = opened()
+    explorer = opened(out=tmp_path)
     before = screen(explorer)
     np.testing.assert_array_equal(explorer.poke, data.pokes[0], err_msg="it begins with the recorded poke")
     np.testing.assert_allclose(explorer.flow, ask(run, data, 0).flow, atol=1e-4)
@@ -84,6 +84,8 @@ def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorde
     frozen = screen(explorer)
     explorer.canvas.draw()
     np.testing.assert_array_equal(screen(explorer), frozen, err_msg="drawing all shows something else than blitting")
+    do(explorer, "key s")
+    np.testing.assert_array_equal(np.array(Image.open(tmp_path / "explore_1.png")), frozen, err_msg="saved incompletely")
 
 
 def test_poke_shows_the_truth_with_the_error_and_is_taken_back(recorded):
@@ -200,7 +202,7 @@ def test_a_script_saves_pictures_and_is_filmed(tmp_path, capsys, monkeypatch):
     (tmp_path / "script").write_text("drag 30 20 34 16  # a poke\nkey space\n\nwait 0.5\nkey s\n")
     assert main(["explore", str(FOLDER), "--script", "script", "--demo", "out.gif"]) == 0
     with Image.open("explore_1.png") as picture, Image.open("out.gif") as film:
-        assert picture.size == (975, 585) == film.size and film.n_frames > 3
+        assert picture.size == (930, 532) == film.size and film.n_frames > 3
     assert capsys.readouterr().out == "out.gif: 3 s\n"
 
 
