@@ -37,6 +37,7 @@ VARIANTS = {
     "ReLU, not leaky": ([("ops.py", "LEAK = np.float32(0.1)", "LEAK = np.float32(0.0)")], {}, 0.0),
     "no image noise": ([], {"image_noise": 0.0}, 0.0),
     "no height map": ([("networks.py", "return (total / (count + 0.2) / 0.03)", "return (0 * total)")], {}, 0.0),
+    "no walls in the height map": ([("networks.py", " + wall_map(pokes, arena)", "")], {}, 0.0),
     "no pooling where the finger first meets something": (
         [("networks.py", "weights = met * central", "weights = 0 * central")], {}, 0.0),
     "looks at all points of the box": ([("scene.py", "scene.valid & scene.stands_out & away", "scene.valid & away")],

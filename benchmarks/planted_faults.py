@@ -124,7 +124,7 @@ PLANTED = (
         ("elites of infinite cost are kept", "order[:search.elites] if costs[j] < np.inf", "order[:search.elites]"),
         ("directions leave the circle", "population[..., 2] = wrapped(population[..., 2])", "pass"),
         ("a cheap sequence that no finger can start is planned",
-         "np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, np.mean(steps, axis=0))", "np.mean(steps, axis=0)")]),
+         "np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, found)", "found")]),
 
     ("disk/files.py", "files", [
         ("a half-written file stays behind", "temporary.unlink(missing_ok=True)", "pass"),

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 
 from hind4sight_min import networks
+from hind4sight_min.networks import wall_map
 from hind4sight_min.losses import EDGE_SHARPNESS, seen_in_both
 from hind4sight_min.ops import LEAK
 from hind4sight_min.scene import look
@@ -24,7 +25,8 @@ def tensors(batch):
     arrays = {**vars(before), **{f"next_{name}": value for name, value in vars(after).items()}}
     arrays["shared"], arrays["next_shared"] = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     next_rows, next_seen = look(after, batch.pokes)
-    arrays.update(rows=rows, seen=seen, next_rows=next_rows, next_seen=next_seen, pokes=batch.pokes)
+    arrays.update(rows=rows, seen=seen, next_rows=next_rows, next_seen=next_seen, pokes=batch.pokes,
+                  walls=wall_map(batch.pokes, before.arena))
     arrays.update(zip(("changed", "next_changed", "change", "centres"), batch.evidence))
     arrays["start"], arrays["end"] = batch.cells.T
     return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
@@ -103,12 +105,12 @@ def so3_exp(w):
     return torch.eye(3, dtype=w.dtype) + a[..., None, None] * cross + b[..., None, None] * (cross @ cross)
 
 
-def forward_model(p, sizes, points, valid, pokes):
+def forward_model(p, sizes, points, valid, pokes, walls):
     """-> predicted points, masks (B, M, K); networks.forward_model."""
     axes, origins = poke_axes(pokes)
     local = (points - origins[:, None]) @ axes
     met = first_met(local, valid)[:, None]
-    shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid)))))
+    shape = activation(linear(p, "shape_2", activation(linear(p, "shape_1", height_map(local, valid) + walls))))
 
     def context(h):
         return torch.cat([max_over_points(h, valid), (met @ h)[:, 0], shape], dim=1)
@@ -138,7 +140,7 @@ def predict(p, sizes, b):
     """-> all predicted points, and the masks of those looked at; networks.predict."""
     rows = at(b["rows"])
     points = b["points"][rows]
-    found, masks = forward_model(p, sizes, points, b["seen"], b["pokes"])
+    found, masks = forward_model(p, sizes, points, b["seen"], b["pokes"], b["walls"])
     return b["points"].index_put(rows, torch.where(b["seen"][..., None], found, points)), masks
 
 

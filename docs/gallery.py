@@ -167,8 +167,18 @@ def link(path, text):
     return f"[{text}](../{path})"
 
 
+def says(tutorial, name):
+    """What a picture shows, for those who cannot see it: the title that the script gives it, else the lesson's own."""
+    kept = re.split(rf'lesson\.keep\(options, \w+, "{Path(name).stem[3:]}"', tutorial.path.read_text())
+    titles = re.findall(r'\.suptitle\(((?:\s*f?"(?:[^"\\]|\\.)*")+)', kept[0]) if len(kept) > 1 else []
+    if not titles or "lesson.keep" in kept[0].rpartition(".suptitle(")[2]:  # that was another picture's
+        return tutorial.title
+    text = "".join(re.findall(r'"((?:[^"\\]|\\.)*)"', titles[-1]))
+    return re.sub(r"\{[^}]*\}", "\u2026", text).replace("$", "").replace("[", "(").replace("]", ")")
+
+
 def section(tutorial):
-    pictures = "\n\n".join(f"![{tutorial.title}](gallery/{name})" for name in tutorial.pictures[:SHOWN])
+    pictures = "\n\n".join(f"![{says(tutorial, name)}](gallery/{name})" for name in tutorial.pictures[:SHOWN])
     ending = "\n".join(["```", *tutorial.lines, "```"])
     script = link(f"tutorials/{tutorial.path.name}", f"`tutorials/{tutorial.path.name}`")
     return (f"## {tutorial.number} {tutorial.title}\n\n{tutorial.question}\n\n{pictures}\n\n"

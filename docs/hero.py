@@ -23,14 +23,13 @@ from hind4sight_min.networks import predict
 from hind4sight_min.sim.arena import Arena
 from hind4sight_min.sim.truth import true_scene_flow
 
-import cv2  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from PIL import Image  # noqa: E402
 
 OUT = Path(__file__).resolve().parent / "hero.gif"
-WIDTH = 384  # px of a photograph; two stand side by side
-EVERY = 30  # steps of the simulator, an eighth of a second, from one picture of a film to the next
+WIDTH, HEIGHT = 384, 288  # px of a photograph; two stand side by side, pixel by pixel
+CANVAS = 800, 370  # px
 SEEN = 0.05  # m, on average over the points that move: what is long enough to see
 CARD, INK, DIM = "#22272e", "#f0f3f6", "#adbac7"  # a card of its own, for light pages and dark ones
 COLOURS = 128
@@ -38,15 +37,18 @@ COLOURS = 128
 
 # --- what happens -------------------------------------------------------------------------------------------------
 
-def film_pokes(arena):
-    """From now on the arena keeps pictures of every poke -> a list that grows by a list of photographs a poke."""
+def film_pokes(arena, every):
+    """From now on the arena keeps pictures of its pokes -> a list that grows by a list of photographs a poke.
+
+    every: steps of the simulator, of 1/240 s, from one to the next.
+    """
     films, step, poke = [], arena._step, arena.poke
 
     def filmed_steps(count):
-        for _ in range(count // EVERY):
-            step(EVERY)
+        for _ in range(count // every):
+            step(every)
             films[-1].append(arena.photograph(width=WIDTH))
-        step(count % EVERY)
+        step(count % every)
 
     def filmed_poke(*where):
         films.append([])
@@ -76,7 +78,7 @@ def one_poke(run, seed):
             if moving.any() and np.linalg.norm(flow[moving], axis=1).mean() > SEEN:
                 break
         photograph, poses = arena.photograph(width=WIDTH), arena.poses()
-        films = film_pokes(arena)
+        films = film_pokes(arena, 10)
         arena.poke(*drawn)
         true = true_scene_flow(scene.points[0].reshape(*labels.shape, 3), labels, poses, arena.poses()).reshape(-1, 3)
         moved = np.linalg.norm(true, axis=1) > 0.001  # m
@@ -91,7 +93,7 @@ def planned(run, seed):
     """Three objects brought to their goals -> the record of the closed loop, photographs and films with it."""
     with control.random_task(seed, 3, settings=control.settings_for(run)) as task:
         arena = task.arena
-        films = film_pokes(arena)
+        films = film_pokes(arena, 30)
         record = control.closed_loop(task, run, "learned", planning.Search(), 10, seed)
         return {**control.photographed(record, task, WIDTH), "camera": arena.camera, "films": films}
 
@@ -101,8 +103,9 @@ def planned(run, seed):
 class Stage:
     """Two pictures side by side on a card, each with a line above it, and one below both; frames are kept."""
 
-    def __init__(self):
-        self.figure = Figure(figsize=(8.0, 3.7), dpi=100, facecolor=CARD)
+    def __init__(self, width, height):  # of the model's pictures, px, in which everything is drawn
+        self.view = -0.5, width - 0.5, height - 0.5, -0.5
+        self.figure = Figure(figsize=np.array(CANVAS) / 100, dpi=100, facecolor=CARD)
         self.canvas, self.frames, self.seconds = FigureCanvasAgg(self.figure), [], []
 
     def show(self, seconds, left, right, caption, draw=None):
@@ -110,9 +113,10 @@ class Stage:
         self.figure.clear()
         both = []
         for i, (picture, title) in enumerate((left, right)):
-            axes = self.figure.add_axes((0.0125 + 0.4975 * i, 0.115, 0.4775, 0.775))
-            axes.imshow(picture, interpolation="nearest", extent=(-0.5, 63.5, 47.5, -0.5), aspect="auto")
-            axes.set(xlim=(-0.5, 63.5), ylim=(47.5, -0.5))
+            x, (wide, high) = (CANVAS[0] - 10 - WIDTH if i else 10), CANVAS
+            axes = self.figure.add_axes((x / wide, 42 / high, WIDTH / wide, HEIGHT / high))
+            axes.imshow(picture, interpolation="nearest", extent=self.view, aspect="auto")
+            axes.set(xlim=self.view[:2], ylim=self.view[2:])
             axes.axis("off")
             axes.set_title(title, color=INK, fontsize=12)
             both.append(axes)
@@ -140,8 +144,8 @@ def tell_poke(stage, found):
     arrow, small = on_table([start, target], camera), found["rgb"]
     points, flow, moving = (found[name] for name in ("points", "flow", "moving"))
     masks = found["masks"][:, 1:].reshape(camera.height, camera.width, -1)
-    large = [cv2.resize(each, before.shape[1::-1], interpolation=cv2.INTER_NEAREST) for each in np.moveaxis(masks, 2, 0)]
-    masked = blend(before / 255, np.stack(large, axis=2))
+    times = len(before) // camera.height  # a mask has the model's pixels, a photograph more
+    masked = blend(before / 255, masks.repeat(times, axis=0).repeat(times, axis=1))
     colours = PALETTE[found["masks"][moving, 1:].argmax(axis=1)]
     pixels = project(np.stack([points[moving], (points + flow)[moving]]), camera)  # (2, n, 2)
 
@@ -150,8 +154,9 @@ def tell_poke(stage, found):
             draw_arrow(axes, *arrow)
 
     def arrows(axes, other):
-        axes.quiver(*pixels[0].T, *(pixels[1] - pixels[0]).T, color="black", angles="xy", scale_units="xy", scale=1,
-                    width=0.004)
+        some = (np.rint(pixels[0]) % 3 == 1).all(axis=1)  # every third pixel each way: the masks stay visible
+        axes.quiver(*pixels[0, some].T, *(pixels[1] - pixels[0])[some].T, color="black", angles="xy",
+                    scale_units="xy", scale=1, width=0.005)
         poke(other)
 
     def dots(share):
@@ -159,15 +164,16 @@ def tell_poke(stage, found):
             axes.scatter(*(pixels[0] + share * (pixels[1] - pixels[0])).T, c=colours, s=16, edgecolors="black",
                          linewidths=0.4)
         return draw
-    seen = (before, "what the camera sees"), (small, "what the model gets: 64 x 48, with depth")
+    gets = f"what the model gets: {camera.width} x {camera.height}, with depth"
+    seen = (before, "what the camera sees"), (small, gets)
     stage.show(2.5, *seen, "A robot pokes things to learn how they move. Nobody labels anything.")
     stage.show(2.0, *seen, "It is about to push along the arrow. What will move, and where to?", poke)
-    stage.show(3.0, (masked, "predicted: what moves (colour), and how (arrows)"), (before, "before"),
-               "Masks and motions come from one picture and the poke.", arrows)
+    stage.show(3.0, (masked, "predicted: masks (colour), motion (arrows)"), (before, "before"),
+               "The model says what moves as one, and where to, from one picture and the poke.", arrows)
     film = [*found["film"], found["after"]]
     for i, picture in enumerate(film):
-        share = np.clip(i / (len(film) - 4), 0, 1)
-        stage.show(0.12, (before, "predicted"), (picture, "what happens"), "The same push, imagined and real.",
+        share = min(i / (len(film) - 6), 1)  # the last pictures are of rest
+        stage.show(0.08, (before, "predicted"), (picture, "what happens"), "The same push, imagined and real.",
                    dots(share))
     stage.show(3.5, (found["after"], "the prediction, over what came"), (found["after"], "what came"),
                f"Off by {100 * found['error']:.1f} cm after a motion of {100 * found['motion']:.1f} cm.", dots(1))
@@ -210,7 +216,8 @@ def main():
     parser.add_argument("--out", type=Path, default=OUT, help="a .gif (docs/hero.gif)")
     args = parser.parse_args()
     check_output("--out", args.out, ".gif")
-    run, stage = checkpoints.load_run(args.checkpoint), Stage()
+    run = checkpoints.load_run(args.checkpoint)
+    stage = Stage(run.meta["camera"]["width"], run.meta["camera"]["height"])
     tell_poke(stage, one_poke(run, args.seed))
     tell_plan(stage, planned(run, args.seed))
     stage.save(args.out)

@@ -18,11 +18,13 @@ from hind4sight_min.geometry import optical_flow
 from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab import evaluation
 from hind4sight_min.lab.cli import data_small
-from hind4sight_min.lab.figures import TERM_COLOURS, blend, draw_arrow, flow_to_rgb, on_table, save_figure, show_image
+from hind4sight_min.lab.figures import (TERM_COLOURS, blend, draw_arrow, draw_wheel, on_table, save_figure,
+                                        show_flow, show_image, zoom)
 from hind4sight_min.lab.noise import with_depth_noise
 from hind4sight_min.sim.arena import Settings
 from hind4sight_min.sim.collection import collect
 from hind4sight_min.sim.objects import HELD_OUT
+from hind4sight_min.sim.photographs import photographs
 from hind4sight_min.sim.truth import load_truth
 
 import numpy as np  # noqa: E402
@@ -123,18 +125,23 @@ def predictions(run, interactions, truth):
 
 
 def draw(examples):
-    """[(what it shows, data set, one of `predictions`)] -> a figure with a row for each."""
-    figure = Figure(figsize=(10, 2.2 * len(examples)), layout="constrained")
-    for line, (title, data, found) in zip(figure.subplots(len(examples), 4, squeeze=False), examples):
-        shape, row = (data.camera.height, data.camera.width), found["row"]
-        true = found["true"].reshape(*shape, 2)
-        scale = np.linalg.norm(true, axis=2).max()
-        image = data.rgb_before[row] / 255
-        show_image(line[0], image, title.capitalize())
-        draw_arrow(line[0], *on_table([data.starts[row], data.pokes[row, :2]], data.camera))
-        show_image(line[1], blend(image, found["masks"].reshape(*shape, -1)[..., 1:]), "Predicted masks")
-        show_image(line[2], flow_to_rgb(found["flow"], scale), "Predicted optical flow")
-        show_image(line[3], flow_to_rgb(true, scale), "True optical flow, same colours")
+    """[(what it shows, data set, its truth, one of `predictions`)] -> a figure with a row for each."""
+    figure = Figure(figsize=(12, 2.25 * len(examples)), layout="constrained")
+    for line, (title, data, truth, found) in zip(figure.subplots(len(examples), 5, squeeze=False), examples):
+        width, height, row = data.camera.width, data.camera.height, found["row"]
+        true, predicted = (found[name].reshape(height, width, 2) for name in ("true", "flow"))
+        scale, image = np.linalg.norm(true, axis=2).max(), data.rgb_before[row] / 255
+        photograph, _ = photographs(data, truth, [row], 320).get(row, (image, None))
+        show_image(line[0], photograph, title.capitalize(), extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+        show_image(line[1], image, f"What the model gets\n({width} x {height}; framed part)")
+        show_image(line[2], blend(image, found["masks"].reshape(height, width, -1)[..., 1:]), "Predicted masks")
+        show_flow(line[3], predicted, scale, "Predicted optical flow")
+        show_flow(line[4], true, scale, "True optical flow,\nthe same colours")
+        arrow = on_table([data.starts[row], data.pokes[row, :2]], data.camera)
+        for axes in line[:2]:
+            draw_arrow(axes, *arrow)
+        draw_wheel(line[4], scale, low=arrow[1, 1] <= arrow[0, 1])  # what moves upwards leaves room below
+        zoom(line[1:], line[:1], arrow[1], (width, height))
     return figure
 
 
@@ -157,7 +164,7 @@ def failures(run, interactions, truth):
         for kind, holds in kinds.items():
             if holds and (kind not in worst or found["error"] > worst[kind]["error"]):
                 worst[kind] = found
-    return draw([(kind, interactions, found) for kind, found in sorted(worst.items())])
+    return draw([(kind, interactions, truth, found) for kind, found in sorted(worst.items())])
 
 
 def emergent(run, interactions, truth, pokes=120):
@@ -170,7 +177,7 @@ def emergent(run, interactions, truth, pokes=120):
         found = [each for each in predictions(run, data, labels) if each["motion"] > 0.03]  # m^2: well moved
         found.sort(key=lambda each: each["error"] / each["motion"])
         for share, where in ((0.25, "best quarter"), (0.5, "median"), (0.75, "worst quarter")):
-            examples.append((f"{name}, {where}", data, found[int(share * len(found))]))
+            examples.append((f"{name},\n{where}", data, labels, found[int(share * len(found))]))
     return draw(examples)
 
 

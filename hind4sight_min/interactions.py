@@ -11,6 +11,7 @@ import numpy as np
 from .geometry import Camera
 
 PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
+MOST_DEPTH = 6.5  # m: what is beyond does not fit into a shard
 
 
 @dataclass
@@ -55,6 +56,9 @@ class Interactions:
                                  f"got {value.dtype}")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+            if "depth" in name and not (value.min(initial=0) >= 0 and value.max(initial=0) <= MOST_DEPTH):
+                raise ValueError(f"{name}: expected 0 (missing) to {MOST_DEPTH} m, got {value.min():g} to "
+                                 f"{value.max():g}")
             if name in ("depth_before", "depth_after") and not (value.max(axis=(1, 2)) > 0).all():
                 raise ValueError(f"{name}: expected depth in every picture, got none in row "
                                  f"{value.max(axis=(1, 2)).argmin()}")

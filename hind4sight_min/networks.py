@@ -90,6 +90,14 @@ def height_map(local, valid):
     return (total / (count + 0.2) / 0.03).reshape(len(local), -1)
 
 
+def wall_map(pokes, arena):
+    """The walls in the same cells, (B, 140): 1 behind them, 0 in front. pokes (B, 3); arena: its side in m."""
+    axes, origins = poke_axes(pokes)
+    cells = MAP_CELL * np.stack(np.meshgrid(MAP_X, MAP_Y, [0], indexing="ij"), axis=-1).reshape(-1, 3)
+    away = np.abs(np.matmul(cells, np.swapaxes(axes, 1, 2)) + origins[:, None])[..., :2].max(axis=2)
+    return np.clip((away - arena / 2) / MAP_CELL + 0.5, 0, 1).astype(np.float32)
+
+
 ABOVE = 0.005  # m; lower points are the table's
 FINGER = 0.014  # m; half the width of what the finger of sim.arena.Settings sweeps: its radius and about half a pixel
 
@@ -164,16 +172,17 @@ def encode(params, points):
 MASK_BOUND = 6.0  # a mover's logit stays within so much of the background's, which is 0
 
 
-def forward_model(params, sizes, points, valid, pokes):
+def forward_model(params, sizes, points, valid, pokes, arena=np.inf):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
     points (B, M, 3) m arena, a set, those that `scene.look` found; valid (B, M) bool, which of them count; pokes
-    (B, 3), (m, m, rad) -> Prediction of these points. The poke enters only as a frame, x along it and its target the
+    (B, 3), (m, m, rad); arena: its side in m -> Prediction of these points. The poke enters only as a frame, x along it and its target the
     origin, that all but the encoder sees points in: where the finger came down is not told, as in the paper's u_t.
     """
     local = poke_frame(points, pokes)
     met = first_met(local, valid)[:, None]
-    shape = layer(params, "shape_2", layer(params, "shape_1", height_map(local, valid)))  # (B, C)
+    shape = layer(params, "shape_1", height_map(local, valid) + wall_map(pokes, arena))
+    shape = layer(params, "shape_2", shape)  # (B, C)
 
     def context(h):  # (B, M, C) -> (B, 3 C)
         return anp.concatenate([max_over_points(h, valid), anp.matmul(met, h)[:, 0], shape], axis=1)
@@ -231,7 +240,7 @@ def predict(params, sizes, scene, pokes):
     The forward model on the points that `scene.look` finds; all others are background that stays.
     """
     (rows, seen), points = look(scene, pokes), scene.points
-    found = forward_model(params, sizes, points[at_rows(rows)], seen, pokes)
+    found = forward_model(params, sizes, points[at_rows(rows)], seen, pokes, scene.arena)
     still = np.broadcast_to(np.eye(sizes.masks, dtype=points.dtype)[0], points.shape[:2] + (sizes.masks,))
     return Prediction(put_rows(points, rows, found.points), put_rows(still, rows, found.masks),
                       found.rotations, found.translations)

@@ -170,7 +170,7 @@ def moved_scene(view, clouds):
     """The Scene of a view whose points went to clouds (J, N + M, 3) m."""
     shape = clouds.shape[:2]
     flags = {name: np.broadcast_to(getattr(view.scene, name), shape) for name in ("valid", "occupied", "stands_out")}
-    return Scene(clouds, **flags)
+    return Scene(clouds, **flags, arena=view.scene.arena)
 
 
 # --- the cost ----------------------------------------------------------------------------------------------------
@@ -253,12 +253,12 @@ class Plan:
 def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None):
     """The best sequence of pokes to a goal that CEM finds -> Plan.
 
-    The cost of a sequence is the mean over the scenes after each of its pokes, so that an early gain counts.
+    The cost of a sequence is that of the scene after its last poke: to make room for another is no gain yet.
     """
     def cost(sequences):
         clouds, starts = rollout(sequences)
-        steps = [planning_cost(after, view, goal, camera, search) for after in np.moveaxis(clouds, 1, 0)]
-        return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, np.mean(steps, axis=0))
+        found = planning_cost(clouds[:, -1], view, goal, camera, search)
+        return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, found)
 
     first = draw_pokes(rng, search.candidates, view, settings, search.horizon)
     pokes, lowest = cem(cost, first, rng, search, on_iteration)

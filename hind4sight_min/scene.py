@@ -19,12 +19,14 @@ class Scene:
     points (B, N, 3) float32 m, arena. valid (B, N) bool: has depth. occupied (B, N) bool: of an object, Sec. IV-A.
     stands_out (B, N) bool: nearer than the empty arena by more than OCCUPIED, or within RIM of a point that is.
     images (B, H, W, 3) float32 in [0, 1], N = H W but for marks; None where planning has moved the points.
+    arena: its side in m, between the walls.
     """
     points: np.ndarray
     valid: np.ndarray
     occupied: np.ndarray
     stands_out: np.ndarray
     images: np.ndarray = None
+    arena: float = np.inf
 
 
 OCCUPIED = 0.008  # m: background subtraction takes what is nearer than the empty arena by more for an object
@@ -46,7 +48,7 @@ def scene_of(depth, rgb, empty_depth, camera, arena):
     stands_out = np.stack([cv2.dilate(each, around) for each in near.astype(np.uint8)]) > 0
     flat = depth.shape[0], -1
     return Scene(points.reshape(*flat, 3), depth.reshape(flat) > 0, (near & inside).reshape(flat),
-                 stands_out.reshape(flat), rgb.astype(np.float32) / 255)
+                 stands_out.reshape(flat), rgb.astype(np.float32) / 255, arena)
 
 
 # --- where the model looks ----------------------------------------------------------------------------------------
@@ -96,8 +98,8 @@ def crop(scene, pokes, camera):
         return np.stack([each[y:y + rows, x:x + columns] for each, x, y in zip(pictures, left, top)])
     shape = len(pokes), camera.height, camera.width
     flat = {name: cut(value.reshape(*shape, *value.shape[2:])).reshape(len(pokes), -1, *value.shape[2:])
-            for name, value in vars(scene).items() if name != "images"}
-    return Scene(**flat, images=cut(scene.images))
+            for name, value in vars(scene).items() if name not in ("images", "arena")}
+    return Scene(**flat, images=cut(scene.images), arena=scene.arena)
 
 
 # --- what changed: the evidence of a poke, for the inverse model --------------------------------------------------

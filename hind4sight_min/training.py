@@ -7,7 +7,7 @@ from autograd import grad
 from autograd.tracer import getval
 
 from . import check_whole, losses
-from .geometry import Camera, optical_flow
+from .geometry import optical_flow
 from .interactions import cell_centres, cells_of
 from .networks import Sizes, init_parameters, inverse_model, predict, state_embedding
 from .ops import at_rows, take, unflatten
@@ -272,21 +272,13 @@ def training_step(data, run, objective=unsupervised, map=map):
 def train(data, run, objective=unsupervised, map=map, on_step=None):
     """Go on with a run to its recipe's last step; updates and returns it. on_step(run, terms) is called after each.
 
-    data: Interactions; for another objective, whatever it takes, with len(), rows by index array and a camera. map: as
+    data: Interactions; for another objective, whatever it takes, with len() and rows by index array. map: as
     Python's; lab/processes.py has one for several processes. The chunks' gradients are added in order, so the result
     does not depend on it (if BLAS has one thread: import the package before NumPy).
-    Raises ValueError for a data set of another camera, FloatingPointError if a gradient is not finite.
+    Raises FloatingPointError if a gradient is not finite.
     """
-    check_camera(run, data.camera)
     while run.step < run.recipe.steps:
         terms = training_step(data, run, objective, map)
         if on_step:
             on_step(run, terms)
     return run
-
-
-def check_camera(run, camera):
-    """Raise ValueError when a run was trained with another camera than this one."""
-    trained = Camera(**run.meta["camera"])
-    if not all(np.allclose(getattr(trained, name), getattr(camera, name), rtol=1e-6) for name in vars(camera)):
-        raise ValueError("camera: another camera than the checkpoint was trained with")

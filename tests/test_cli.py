@@ -14,8 +14,9 @@ import pytest
 from hind4sight_min import losses, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.disk.shards import load_interactions, save_shard
-from hind4sight_min.lab import cli, control
+from hind4sight_min.lab import cli, control, evaluation
 from hind4sight_min.lab.cli import data_small, main
+from hind4sight_min.lab.camera_faults import under_faults
 from hind4sight_min.lab.noise import under_noise
 from hind4sight_min.networks import Sizes, encode, predict, state_embedding
 from hind4sight_min.scene import crop
@@ -89,6 +90,29 @@ def test_a_resumed_run_is_the_same_run_with_its_noise(small, tmp_path, capsys):
     np.testing.assert_array_equal(vector(stopped), vector(whole), err_msg="resumed without its noise?")
 
 
+def test_a_run_for_cameras_trains_under_faults_and_says_so(small, tmp_path, capsys):
+    assert run("train", small / "train", tmp_path / "a.npz", *TINY, "--camera-faults") == 0
+    found, data = checkpoints.load_run(tmp_path / "a.npz"), load_interactions(small / "train")
+    assert found.meta["camera_faults"] is True
+    again = training.train(data, training.start_run(found.recipe, data), under_faults)
+    np.testing.assert_array_equal(found.vector, again.vector, err_msg="another objective than lab.camera_faults'?")
+    one_line(capsys, run("train", small / "train", tmp_path / "b.npz", *TINY, "--camera-faults", "--depth-noise", 0.01),
+             "--depth-noise", "--camera-faults")
+
+
+def test_a_run_that_starts_from_another_one_has_its_parameters_and_nothing_else_of_it(small, tmp_path, capsys):
+    first, data = small / "checkpoint.npz", load_interactions(small / "train")
+    options = ["--steps", 3, "--batch", 2, "--jobs", 1, "--seed", 4, "--start-from", first]
+    assert run("train", small / "train", tmp_path / "a.npz", *options) == 0
+    again = training.start_run(training.Recipe(steps=3, batch=2, seed=4, sizes=Sizes(width=8)), data)
+    again.vector = vector(first)
+    np.testing.assert_array_equal(vector(tmp_path / "a.npz"), training.train(data, again).vector)
+    found = checkpoints.load_run(tmp_path / "a.npz").meta
+    assert found["started_from"] == checkpoints.load_run(first).meta["data"] and found["log"][-1]["step"] == 3
+    one_line(capsys, run("train", small / "train", tmp_path / "b.npz", *options, "--width", 9), "--start-from", "width")
+    one_line(capsys, run("train", small / "train", tmp_path / "b.npz", *TINY, "--start-from", "none.npz"), "none.npz")
+
+
 # --- evaluate and show ----------------------------------------------------------------------------
 
 def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp_path, capsys):
@@ -97,6 +121,28 @@ def test_the_shipped_checkpoint_on_the_shipped_pokes_is_what_the_results_say(tmp
     recorded = json.loads((ROOT / "docs" / "results" / "shipped.json").read_text())["figures"]
     assert metrics == pytest.approx(recorded, rel=0.01, abs=1e-6)  # other NumPys and OpenCVs round differently
     assert "\r" not in capsys.readouterr().err, "a progress line away from a terminal"
+
+
+def test_evaluate_shows_the_pokes_with_the_faults_asked_for(small, tmp_path, capsys):
+    faults = {"depth_noise": 0.005, "missing": [0.2, "rims"], "pitch_error": 0.5, "pose_error": [0.3, 0.004]}
+    options = ["--depth-noise", 0.005, "--missing", 0.2, "--missing", "rims", "--pitch-error", 0.5,
+               "--pose-error", 0.3, 0.004]
+    assert run("evaluate", small / "checkpoint.npz", small / "train", *options, "--json", tmp_path / "a.json") == 0
+    model, data = checkpoints.load_run(small / "checkpoint.npz"), load_interactions(small / "train")
+    expected = evaluation.evaluate(model, data, load_truth(small / "train"), **faults)
+    assert json.loads((tmp_path / "a.json").read_text()) == expected
+    for name in faults:
+        others = {other: value for other, value in faults.items() if other != name}
+        assert evaluation.evaluate(model, data, load_truth(small / "train"), **others) != expected, name
+    one_line(capsys, run("evaluate", small / "checkpoint.npz", small / "train", "--missing", "rim"), "missing", "rims")
+
+
+def test_camera_is_the_shipped_checkpoint_for_cameras():
+    parse = cli.build_parser().parse_args
+    for command in ("evaluate", "show", "plan"):
+        assert parse([command, "camera"]).checkpoint == data_small() / "camera_checkpoint.npz"
+        assert parse([command, "runs/camera"]).checkpoint == Path("runs/camera")
+        assert parse([command]).checkpoint == data_small() / "checkpoint.npz"
 
 
 def test_every_layer_of_the_shipped_checkpoint_is_alive():
@@ -131,7 +177,7 @@ def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_
 def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsys):
     assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures",
                "rings", "--size", 96, 72, "--within", 0.5, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
-    assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["shard_0000.npz", "shard_0000.truth.npz"]
+    assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["collection.json", "shard_0000.npz", "shard_0000.truth.npz"]
     data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
     assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
     assert data.settings["place_within"] == 0.5
@@ -148,6 +194,7 @@ def test_plan_says_and_draws_what_it_did(own_goal, small, tmp_path, capsys):
                1, "--seed", 1, *goal, "--out", tmp_path, "--json", tmp_path / "plan.json") == 0
     out, found = capsys.readouterr().out, json.loads((tmp_path / "plan.json").read_text())
     assert "poke 1 to (" in out and "cm from the goals" in out
+    assert found["plan_stopped"] == "the budget of pokes, 1, is spent" and f"stopped: {found['plan_stopped']}\n" in out
     assert found["plan_pokes"] == 1 and 0 < found["plan_distance_left"] < 1
     assert (tmp_path / "plan.gif").read_bytes().startswith(b"GIF89a")
 
@@ -198,7 +245,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     assert out.count(cli.NO_BULLET) == 1 and "\n" not in cli.NO_BULLET and "pip install pybullet" in cli.NO_BULLET
     assert short_demo()[0] == pytest.approx(figures), "a second time, the same"
     one_line(capsys, run("collect", tmp_path / "new", "--pokes", 1, "--jobs", 1), "pybullet", "pip install")
-    assert not list(tmp_path.glob("new/*"))
+    assert not list(tmp_path.glob("new/*.npz"))
 
 
 # --- what is wrong ends in one line ---------------------------------------------------------------

@@ -28,7 +28,7 @@ def shifted_block(count, shift):
 def oracle(monkeypatch):
     """A function that makes `ask` answer with a share of the true motion, a drift in m of all else, and good maps."""
     def answering(truth, share, drift=0.0):
-        def ask(run, interactions, row, depth_noise=0.0):
+        def ask(run, interactions, row, **faults):
             before, after = scenes_of(interactions[[row]])
             labels = truth.labels[row].ravel()
             moves = np.zeros_like(before.points) + np.float32([drift, 0, 0])
@@ -79,13 +79,40 @@ def test_a_point_moves_when_its_motion_is_longer_than_a_millimetre(oracle, shift
             metrics(oracle, 0.0, shift=(shift, 0, 0))
 
 
-def test_missing_depth_is_not_scored(oracle):
+def test_a_moving_point_without_depth_counts_and_a_still_one_does_not(oracle):
     data = tiny_pokes()
     data.depth_before[:, 3, 4:8] = 0  # a third of the block
+    data.depth_before[:, 0, :5] = 0  # and some of the table
     found = metrics(oracle, 0.5, data=data)
-    assert found["all_epe_cm"] == pytest.approx(8 * 2.5 / 188, rel=1e-3)
+    assert found["all_epe_cm"] == pytest.approx(12 * 2.5 / 187, rel=1e-3)
+    assert found["no_motion_epe_cm"] == pytest.approx(5.0, rel=1e-3)
     for name in ("optical_epe", "no_motion_optical_epe"):
-        assert found[f"{name}_all_px"] == pytest.approx(found[f"{name}_px"] * 8 / 188), name
+        assert found[f"{name}_all_px"] == pytest.approx(found[f"{name}_px"] * 12 / 187), name
+
+
+def test_a_model_that_sees_holes_predicts_no_motion_there(monkeypatch):
+    data, run = tiny_pokes(count=1), random_run(TINY)
+    data.depth_before[0, 3:5, 4:8] = 0
+    truth = shifted_block(1, (0.03, 0.04, 0.0))
+    flow, pixels, moving = evaluation.true_motion(data, truth, 0)
+    assert moving.sum() == 12 and moving.reshape(12, 16)[3:6, 4:8].all()
+    np.testing.assert_allclose(np.linalg.norm(flow[moving], axis=1), 0.05, rtol=1e-4)
+    assert (np.linalg.norm(pixels[moving], axis=1) > 0.5).all() and (np.linalg.norm(pixels[moving], axis=1) < 2).all()
+    answer = evaluation.ask(run, data, 0)
+    there = np.ix_([0], np.flatnonzero(moving)[:8])
+    np.testing.assert_array_equal(answer.prediction.points[there], answer.before.points[there])
+    assert errors_of_poke(run, data, truth, 0)["squared_error"] >= 8 * 0.05 ** 2 * 0.999
+
+
+def test_an_object_s_holes_have_its_depth_nearest_by_not_that_of_what_it_hides():
+    depth, labels = np.full((5, 6), 0.9), np.zeros((5, 6), int)
+    labels[1:4, 1:4], labels[4, 5] = 1, 2
+    depth[1:4, 1:4] = [[0.5, 0, 0.7], [0.5, 0.6, 0], [0, 0, 0]]
+    depth[4, 5] = depth[0, 0] = 0
+    found = evaluation.depth_of_objects(depth, labels)
+    assert found[2, 3] in (0.6, 0.7) and found[3, 1] == 0.5 and found[3, 2] == 0.6 and found[1, 2] in (0.5, 0.6, 0.7)
+    assert found[0, 0] == 0 and found[4, 5] == 0, "the table's holes stay, and an object without any depth"
+    np.testing.assert_array_equal(found[depth > 0], depth[depth > 0])
 
 
 def test_an_object_that_turned_is_scored_point_by_point(oracle):
@@ -189,9 +216,10 @@ def test_depth_noise_is_what_the_model_sees_its_own_for_every_poke_and_not_what_
     data = replace(data, **{name: np.repeat(getattr(data, name)[:1], 20, axis=0) for name in
                             ("depth_before", "depth_after", "rgb_before", "rgb_after")})  # twenty times the same
     run, truth = random_run(TINY), shifted_block(20, (0.03, 0.04, 0.0))
-    answers = [evaluation.ask(run, data, row, 0.01) for row in range(20)]
+    answers = [evaluation.ask(run, data, row, depth_noise=0.01) for row in range(20)]
     pictures = np.stack([scene.points[0] for answer in answers for scene in (answer.before, answer.after)])
     assert len(np.unique(pictures[:, :, 2], axis=0)) == 40, "the same noise for several pictures"
-    np.testing.assert_array_equal(evaluation.ask(run, data, 3, 0.01).before.points, answers[3].before.points)
+    again = evaluation.ask(run, data, 3, depth_noise=0.01)
+    np.testing.assert_array_equal(again.before.points, answers[3].before.points)
     clean, noisy = (evaluate(run, data, truth, depth_noise=sd) for sd in (0.0, 0.01))
     assert noisy["no_motion_mse_cm2"] == clean["no_motion_mse_cm2"] and noisy["all_epe_cm"] != clean["all_epe_cm"]

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -354,7 +355,8 @@ def test_a_class_is_graded_past_the_broken_ones_and_goes_on_where_it_was(tmp_pat
         os.mkfifo(folder / os.fsdecode(name) / "chamfer.py" / "chamfer.py")
     few = items("seen_in_both")
     monkeypatch.setattr(grading, "items_of", lambda *_: few)
-    rows = grading.grade_all(folder, CHAMFER, HOW, out)
+    with ThreadPoolExecutor(2) as pool:
+        rows = grading.grade_all(folder, CHAMFER, HOW, out, pool.map)
     found = {row["student"]: float(row["score"]) for row in csv.DictReader(io.StringIO(out.read_text()))}
     assert found == {"Ann Lee": 10, "Bo": 10, "Cy": 0, "Di": 10, "Ed": 0, "Flo": 0, "'=cmd()": 0, "a?b": 0,
                      "??": 0}

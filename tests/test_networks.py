@@ -8,7 +8,7 @@ from tiny import SIZES, random_run, tiny_pokes
 from hind4sight_min import networks
 from hind4sight_min.geometry import poke_axes
 from hind4sight_min.networks import (encode, first_met, forward_model, height_map, init_parameters, inverse_model,
-                                     predict, softmax, state_embedding)
+                                     predict, softmax, state_embedding, wall_map)
 from hind4sight_min.scene import look
 from hind4sight_min.training import scenes_of
 
@@ -130,7 +130,7 @@ def test_predict_moves_what_the_model_looks_at_and_leaves_the_rest():
     for i in range(len(data)):
         part = rows[i, seen[i]]
         alone = forward_model(run.params, SIZES, scene.points[[i]][:, part], np.ones((1, len(part)), bool),
-                              data.pokes[[i]])
+                              data.pokes[[i]], data.settings["arena"])
         np.testing.assert_allclose(found.points[i, part], alone.points[0], atol=1e-6)
         np.testing.assert_allclose(found.masks[i, part], alone.masks[0], atol=1e-5)
         others = np.setdiff1d(np.arange(scene.points.shape[1]), part)
@@ -175,6 +175,19 @@ def test_the_height_map_against_a_loop_over_points():
                     total[b, i, j] += share * max(local[b, n, 2], 0)
     assert (count == 0).any() and (total > 0).any()
     np.testing.assert_allclose(height_map(local, valid), (total / (count + 0.2) / 0.03).reshape(2, 140), atol=1e-12)
+
+
+def test_the_wall_map_against_samples_of_each_cell():
+    pokes = np.array([[0.15, -0.02, 0.3], [-0.05, 0.17, 2.0], [0.0, 0.0, 1.0]])
+    found = wall_map(pokes, 0.4).reshape(3, 14, 10)
+    for poke, cells in zip(pokes, found):
+        turn = Rotation.from_euler("z", poke[2])
+        for i, j in np.ndindex(cells.shape):
+            x, y, _ = turn.apply([(i - 6.5) * 0.02, (j - 4.5) * 0.02, 0]) + [*poke[:2], 0]
+            share = np.clip((max(abs(x), abs(y)) - 0.19) / 0.02, 0, 1)  # 0 a cell's half in front of the wall at 0.2 m
+            assert cells[i, j] == pytest.approx(share, abs=1e-6), "x and y swapped, or the turn's sign?"
+    assert found[:2].max() == 1 and 0 < found[0].mean() < 1 and not found[2].any()
+    assert not wall_map(pokes, np.inf).any()
 
 
 def test_first_met_against_a_disc_that_advances():

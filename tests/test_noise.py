@@ -126,21 +126,28 @@ def test_smooth_depth_against_the_sum_by_hand(focal, reach, first):
     depth[0, 4, 6] = 0  # missing
     images = rng.integers(0, 90, (2, 12, 16, 3)).astype(np.uint8)
     difference = np.where(depth > 0, depth - empty, 0)
+
+    def mean(i, row, column, guess=None):
+        """The weighted mean of what is seen around a pixel."""
+        dv, du = np.mgrid[:12, :16] - np.array([row, column])[:, None, None]
+        apart = ((images[i] / 255.0 - images[i, row, column] / 255.0) ** 2).sum(axis=2) / 0.15 ** 2
+        apart += (dv ** 2 + du ** 2) / px ** 2
+        if guess is not None:
+            apart += (guess[i] - guess[i, row, column]) ** 2 / 0.02 ** 2
+        weights = np.exp(-apart / 2) * (np.maximum(abs(dv), abs(du)) <= reach) * (depth[i] > 0)
+        return (weights * difference[i]).sum() / weights.sum()
+    filled = difference.copy()
+    filled[0, 4, 6] = mean(0, 4, 6)
     guess = np.empty_like(difference)  # a bilateral filter; its neighbourhood is a disc, the picture goes on mirrored
     for i, row, column in np.ndindex(2, 12, 16):
         dv, du = np.mgrid[-first:first + 1, -first:first + 1]
-        patch = np.pad(difference[i], first, mode="reflect")[row:, column:][:2 * first + 1, :2 * first + 1]
+        patch = np.pad(filled[i], first, mode="reflect")[row:, column:][:2 * first + 1, :2 * first + 1]
         weights = np.exp(-(dv ** 2 + du ** 2) / (2 * (px / 2) ** 2)
-                         - (patch - difference[i, row, column]) ** 2 / (2 * 0.025 ** 2))
+                         - (patch - filled[i, row, column]) ** 2 / (2 * 0.025 ** 2))
         weights *= dv ** 2 + du ** 2 <= first ** 2
         guess[i, row, column] = (weights * patch).sum() / weights.sum()
     found = smooth_depth(depth, empty, images, cam)
-    assert found.dtype == depth.dtype and found[0, 4, 6] == 0
-    for i, row, column in ((0, 4, 5), (1, 7, 9), (1, 11, 0), (0, 0, 14)):
-        dv, du = np.mgrid[:12, :16] - np.array([row, column])[:, None, None]
-        colour = ((images[i] / 255.0 - images[i, row, column] / 255.0) ** 2).sum(axis=2)
-        weights = np.exp(-(dv ** 2 + du ** 2) / (2 * px ** 2) - colour / (2 * 0.15 ** 2)
-                         - (guess[i] - guess[i, row, column]) ** 2 / (2 * 0.02 ** 2))
-        weights *= (np.maximum(abs(dv), abs(du)) <= reach) & (depth[i] > 0)
-        expected = empty[row, column] + (weights * difference[i]).sum() / weights.sum()
+    assert found.dtype == depth.dtype
+    for i, row, column in ((0, 4, 5), (0, 4, 6), (1, 7, 9), (1, 11, 0), (0, 0, 14)):
+        expected = empty[row, column] + mean(i, row, column, guess)
         assert abs(found[i, row, column] - expected) < 2e-5 < 1e-3 < abs(found[i, row, column] - depth[i, row, column])

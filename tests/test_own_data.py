@@ -1,21 +1,20 @@
-"""Data that the user brings: without truth, without a disk, and by the converter of docs/own-data.md."""
+"""Data that the user brings: without truth, without a disk, and as docs/own-data.md says; test_cameras.py has more."""
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from tiny import TINY, random_run, still_truth, tiny_pokes
 
 from hind4sight_min import losses
 from hind4sight_min.disk import checkpoints
+from hind4sight_min.disk.recordings import load_recording
 from hind4sight_min.disk.shards import load_interactions, save_shard
 from hind4sight_min.geometry import optical_flow
 from hind4sight_min.interactions import PER_POKE
 from hind4sight_min.lab import evaluation, figures
+from hind4sight_min.lab.cameras import camera_of, sampling_of
 from hind4sight_min.lab.cli import main
 from hind4sight_min.sim.truth import find_truth, save_truth
 from hind4sight_min.training import scenes_of, start_run, train
@@ -70,28 +69,30 @@ def test_the_commands_do_with_and_without_truth(known, tmp_path, capsys):
     assert (tmp_path / "poke.png").exists()
 
 
-def test_the_converter_of_the_documentation_runs(tmp_path):
-    made, recorded = tiny_pokes(), tmp_path / "recorded"
-    recorded.mkdir()
-    made.rgb_before[..., 2] //= 3  # not the same in red and blue
+def page(language):
+    """The blocks of a language in docs/own-data.md."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "own-data.md").read_text(), re.DOTALL)
 
-    def counts(depth):
-        return np.round(1000 * depth).astype(np.uint16)
-    cv2.imwrite(str(recorded / "empty.png"), counts(made.empty_depth))
-    for i in range(len(made)):
-        for when in ("before", "after"):
-            cv2.imwrite(str(recorded / f"{i:04d}_{when}.png"), getattr(made, f"rgb_{when}")[i][..., ::-1])
-            cv2.imwrite(str(recorded / f"{i:04d}_{when}_depth.png"), counts(getattr(made, f"depth_{when}")[i]))
-    np.savetxt(recorded / "arena_from_camera.txt", made.camera.arena_from_camera)
-    np.savetxt(recorded / "intrinsics.txt", [made.camera.fx, made.camera.fy, made.camera.cx, made.camera.cy])
-    np.savetxt(recorded / "pokes.csv", np.hstack([made.pokes, made.starts]), delimiter=",", header="x", comments="")
-    converter = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "own-data.md").read_text(), re.DOTALL)[1]
-    (tmp_path / "convert.py").write_text(converter)
-    done = subprocess.run([sys.executable, "convert.py", "recorded", "out"], cwd=tmp_path, capture_output=True,
-                          text=True, env={"PYTHONPATH": str(ROOT)})
-    assert done.returncode == 0, done.stderr
-    found = load_interactions(tmp_path / "out")
+
+def test_the_recording_of_the_documentation_is_one(tmp_path):
+    (tmp_path / "camera.json").write_text(page("json")[0])
+    (tmp_path / "pokes.csv").write_text(page("csv")[0])
+    found = load_recording(tmp_path)
+    assert found.names == ["0000", "0001"] and found.settings["arena"] == 0.5 and found.depth_unit == 0.001
+    np.testing.assert_allclose(found.pokes[1], [-0.110, 0.074, -1.571])
+    np.testing.assert_allclose(found.starts[1], [-0.110, 0.194])
+    camera, _ = camera_of(found, sampling_of(found, (64, 48)), np.ones((48, 64), np.float32))
+    assert camera.fx == pytest.approx(61.52) and camera.cx == pytest.approx(322.9 / 10 - 0.45)
+
+
+def test_the_code_of_the_documentation_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = tiny_pokes()
+    names = {**vars(made), **vars(made.camera)}
+    write, use = page("python")
+    exec(write, names)
+    found = load_interactions("out")
     for name in PER_POKE:
-        np.testing.assert_allclose(getattr(found, name), getattr(made, name), atol=6e-4, err_msg=name)
-    for name, value in vars(made.camera).items():
-        np.testing.assert_allclose(getattr(found.camera, name), value, err_msg=name)
+        np.testing.assert_allclose(getattr(found, name), getattr(made, name), atol=6e-5, err_msg=name)
+    exec(use.replace("Recipe(steps=1000)", "TINY"), {**names, "TINY": TINY})
+    assert (tmp_path / "poke.png").exists()

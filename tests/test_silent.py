@@ -118,14 +118,31 @@ def test_a_second_process_at_the_same_results_is_refused_and_the_dead_are_cleare
             with files.only_one(path):
                 pass
         assert lock.exists(), "the one refused took the lock away"
-    dead = dead_process()
-    lock.write_text(f"{dead} {files.socket.gethostname()}")
-    for name in (f".{dead}.run.npz", f".{dead}.run.csv", f".{os.getpid()}.run.npz", f".{dead}.other.npz"):
+    alive = files.this_process()
+    dead, elsewhere = alive.replace(str(os.getpid()), str(dead_process())), f"{dead_process()}@another.machine"
+    lock.write_text(dead)
+    kept = {f".{alive}.run.npz", f".{elsewhere}.run.npz", f".{dead}.other.npz"}
+    for name in (f".{dead}.run.npz", f".{dead}.run.csv", *kept):
         (tmp_path / name).write_text("half")
     with files.only_one(path):
-        assert {each.name for each in tmp_path.iterdir()} == {
-            ".run.npz.lock", f".{os.getpid()}.run.npz", f".{dead}.other.npz"}
+        assert {each.name for each in tmp_path.iterdir()} == {".run.npz.lock", *kept}
     assert not lock.exists()
+    lock.write_text(elsewhere)
+    with pytest.raises(ValueError, match=f"process {elsewhere} is at work there"):
+        with files.only_one(path):
+            pass
+
+
+def test_two_data_sets_do_not_mix_in_one_folder_even_at_once(tmp_path):
+    path = tmp_path / "collection.json"
+    files.claim(path, {"seed": 1, "sizes": (2, 3)})
+    files.claim(path, {"seed": 1, "sizes": (2, 3)})
+    with pytest.raises(ValueError, match="collection.json: seed: expected what is there, 1, got 2"):
+        files.claim(path, {"seed": 2, "sizes": (2, 3)})
+    assert [each.name for each in tmp_path.iterdir()] == ["collection.json"], "a half-written file stayed"
+    path.write_text("{")
+    with pytest.raises(ValueError, match="collection.json: damaged"):
+        files.claim(path, {"seed": 1})
 
 
 # --- going on with something else ---------------------------------------------------------------------------------
@@ -241,6 +258,7 @@ def test_a_record_of_pokes_that_stops_everything_later_is_refused_at_once(name, 
     ("train data r.npz --batch 100000000", "batch: .*<= 4096"),
     ("train data r.npz --steps 1000000000000", "steps: .*<= "), ("collect c --jobs 100000", "jobs: .*<= 1024"),
     ("plan run.npz --horizon 1000000", "horizon: .*<= 10"), ("plan run.npz --candidates 10000000", "candidates: .*<="),
+    ("collect c --part 9/8", "part: .*<= 8"),
     ("collect c --size 400000 300000", "width: .* to 1280"), ("train data r.npz --width 100000", "width: .*<= 512")])
 def test_a_number_without_bound_is_refused_with_the_largest_that_makes_sense(arguments, said, tmp_path, capsys,
                                                                              monkeypatch):
@@ -325,14 +343,12 @@ def test_an_interrupt_during_import_is_one_line_too():
     assert done.returncode == 130 and done.stderr == "\nhind4sight: stopped\n"
 
 
-@pytest.mark.parametrize("command, results", [
-    ("train data run.npz --steps 1 --batch 2 --width 8 --jobs 1", "run.npz"), ("collect pokes --pokes 3", "pokes")])
-def test_a_command_leaves_results_alone_that_another_process_works_on(command, results, tmp_path, capsys, monkeypatch):
+def test_training_leaves_a_checkpoint_alone_that_another_process_works_on(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data_set(tmp_path / "data")
-    with files.only_one(results):
-        assert run(*command.split()) == 2
-    assert f"{results}: process {os.getpid()} on" in capsys.readouterr().err
+    with files.only_one("run.npz"):
+        assert run(*"train data run.npz --steps 1 --batch 2 --width 8 --jobs 1".split()) == 2
+    assert f"run.npz: process {files.this_process()} is at work" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"data"}
 
 

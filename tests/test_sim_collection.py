@@ -1,15 +1,14 @@
 """Collection: which pokes are kept, what a shard promises, folders that grow shard by shard."""
 import shutil
-from dataclasses import asdict
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from hind4sight_min.geometry import unproject
-from hind4sight_min.disk.files import plain
 from hind4sight_min.disk.shards import load_interactions
-from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.sim import collection
 from hind4sight_min.sim.arena import Arena, Settings
 from hind4sight_min.sim.collection import collect, collect_shard
@@ -60,7 +59,7 @@ def shard():
 def test_a_shard_keeps_its_promises(changed):
     settings = Settings(**changed)
     interactions, truth = collect_shard(settings, 0, 0, 5)
-    assert interactions.settings == plain(asdict(settings))
+    assert interactions.settings == settings.plain
     assert interactions.meta["counts"]["kept"] == len(interactions) == len(truth.labels) == 5
     assert interactions.depth_before.shape == truth.labels.shape == (5, settings.height, settings.width)
     travel = interactions.pokes[:, :2] - interactions.starts
@@ -125,7 +124,8 @@ def contents(folder):
 
 def test_collect_writes_shards_and_reports(collected):
     folder, result, reports = collected
-    assert sorted(contents(folder)) == [f"shard_000{i}{end}" for i in range(3) for end in (".npz", ".truth.npz")]
+    assert sorted(contents(folder)) == ["collection.json", *(f"shard_000{i}{end}" for i in range(3)
+                                                             for end in (".npz", ".truth.npz"))]
     assert len(load_interactions(folder)) == len(load_truth(folder).labels) == 12
     assert reports == [(5, 12), (10, 12), (12, 12)]
     assert result["kept"] == 12 and len(result) == 5
@@ -136,12 +136,21 @@ def test_collect_writes_shards_and_reports(collected):
 
 def test_the_number_of_processes_does_not_change_a_byte_and_the_seed_does(collected, tmp_path):
     reports = []
-    with parallel_map(2) as map:
-        result = collect(tmp_path / "two", 12, 3, SMALL, map, lambda *report: reports.append(report))
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:  # as any executor
+        result = collect(tmp_path / "two", 12, 3, SMALL, pool.map, lambda *report: reports.append(report))
     assert contents(tmp_path / "two") == contents(collected[0])
     assert result == collected[1] and reports == collected[2]
     collect(tmp_path / "other", 5, 4, SMALL)
     assert contents(tmp_path / "other")["shard_0000.npz"] != contents(collected[0])["shard_0000.npz"]
+
+
+def test_parts_are_collected_at_once_and_what_is_missing_afterwards(collected, tmp_path):
+    reports = []
+    with ThreadPoolExecutor(3) as pool:  # each as a process of an array would
+        found = pool.map(lambda i: collect(tmp_path / "parts", 12, 3, SMALL, part=(i, 4)), (1, 2, 4))
+    assert [counts["kept"] for counts in found] == [5, 5, 0], "there are three shards"
+    left = collect(tmp_path / "parts", 12, 3, SMALL, part=(1, 2), progress=lambda *report: reports.append(report))
+    assert left["kept"] == 7 and reports == [(7, 7)] and contents(tmp_path / "parts") == contents(collected[0])
 
 
 @pytest.mark.parametrize("lost", [[], ["shard_0001.npz", "shard_0001.truth.npz"], ["shard_0002.npz"],

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_rel
 from test_se3nets import moved_blocks
 from tiny import TINY, camera, tiny_pokes
 
@@ -52,17 +53,18 @@ def test_every_model_is_trained_with_its_own_terms_for_the_same_budget(model):
         assert noisy.keywords == {"window": window, "depth_noise": 0.01}
 
 
-def test_training_test_and_unseen_pokes_are_three_things(tmp_path, monkeypatch):
+def test_no_test_shares_a_seed_with_another_and_only_unseen_has_what_was_held_out(tmp_path, monkeypatch):
     pytest.importorskip("pybullet")
     calls = {}
     monkeypatch.setattr(tables, "collect", lambda folder, *given: calls.update({folder.name: given}))
     tables.collect_data(tmp_path, tables.FULL)
-    assert {name: call[0] for name, call in calls.items()} == {"train": 24000, "test": 1000, "unseen": 1000}
-    assert len({call[1] for call in calls.values()}) == 3, "two of them have the same seed"
+    pokes = {"train": 48000, "test": 1000, "unseen": 4000, "known": 4000, "all_over": 1000, "crowded": 1000}
+    assert {name: call[0] for name, call in calls.items()} == pokes
+    assert len({call[1] for call in calls.values()}) == len(calls), "two of them have the same seed"
     for kind in ("kinds", "textures"):
         drawn = {name: set(getattr(call[2], kind)) for name, call in calls.items()}
-        assert drawn["unseen"] == set(HELD_OUT[kind])
-        assert drawn["train"] == drawn["test"] and not drawn["train"] & drawn["unseen"]
+        assert drawn["unseen"] == set(HELD_OUT[kind]) and not drawn["train"] & drawn["unseen"]
+        assert drawn["test"] == drawn["known"] <= drawn["train"] == drawn["all_over"]
 
 
 # --- runs that go on ----------------------------------------------------------------------------------------------
@@ -71,7 +73,7 @@ def test_a_cell_goes_on_where_it_was_and_is_run_once(tmp_path, small_world, monk
     cell = Cell("full", "clean", 1, long=True)
     whole = tables.run_cell(cell, tmp_path / "whole", TINY_SCALE)
     assert whole["train_seconds"] > 0 and "unseen_flow_mse_ratio" in whole
-    assert small_world == ["train", "test", "unseen"], "trained on the one, evaluated on the others"
+    assert small_world == ["train", *tables.TESTS], "trained on the one, evaluated on the others"
     save, parts = runs.save_run, tmp_path / "parts" / "cells"
 
     def stop_at_two(path, run):
@@ -110,14 +112,8 @@ def test_a_cell_is_trained_and_evaluated_under_its_noise(model, tmp_path, small_
     assert not np.array_equal(trained[0].vector, trained[1].vector)
 
 
-def test_tasks_are_spread_over_processes():
-    found = tables.run_all(divmod, [(7, 3), (9, 2)], 1)
-    assert list(found) == [((7, 3), (2, 1)), ((9, 2), (4, 1))]
-
-
 def test_all_together(tmp_path, small_world, monkeypatch, capsys):
     monkeypatch.setattr(tables, "collect_data", lambda *_: None)
-    monkeypatch.setattr(tables, "run_all", lambda function, tasks, jobs: [(task, function(*task)) for task in tasks])
     figures = tables.reproduce(["optical-flow"], tmp_path, TINY_SCALE)
     assert "1 of 4: full_clean_long, seed 1: ratio" in capsys.readouterr().out
     assert figures["farneback_optical_epe_px"] > 0
@@ -153,6 +149,17 @@ def test_summary_is_mean_and_sd_over_the_seeds(figures):
     assert figures["full_clean_long_flow_mse_ratio"] == pytest.approx(2 * 0.65)
     assert figures["full_noisy_flow_mse_ratio"] == pytest.approx(2 * 1.55)
     assert figures["seeds"] == TINY_SCALE.seeds and figures["steps"] == TINY_SCALE.steps
+
+
+def test_the_order_of_the_ablation_is_told_by_differences_within_a_seed():
+    ratios = {"2d": (0.30, 0.34, 0.35), "2d_3d": (0.20, 0.23, 0.22), "full": (0.19, 0.23, 0.24), "3d": (0.4, 0.5, 0.6)}
+    found = tables.summarise({Cell(model, noise, seed): {"flow_mse_ratio": value} for model, values in ratios.items()
+                              for noise in tables.NOISES for seed, value in enumerate(values)}, TINY_SCALE)
+    assert found["2d_less_2d_3d_clean"] == pytest.approx((0.10 + 0.11 + 0.13) / 3)
+    interval = ttest_rel(ratios["2d"], ratios["2d_3d"]).confidence_interval(0.95)
+    assert found["2d_less_2d_3d_noisy_ci95"] == pytest.approx((interval.high - interval.low) / 2), "not paired by seed?"
+    row = next(line for line in tables.order_table(found).splitlines() if line.startswith("| 2D loss + 3D loss less full"))
+    assert row == f"| 2D loss + 3D loss less full model | clean | 0.004 | 0.040, 0.039 | -0.003 \u00b1 {0.0379:.3f} |"
 
 
 def test_the_papers_claims_by_hand(figures):
@@ -192,7 +199,7 @@ def record(distance):
     poses = np.zeros((len(distance), 7, 7))
     poses[1:, 1, 0], poses[1:-1, 2, 1] = 0.2, 0.03
     return {"poses": poses, "distance": np.array(distance)[:, None], "movers": np.array([1]), "pokes": np.zeros((2, 3)),
-            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1))}
+            "angle": np.radians([[np.nan, 40.0]] + [[np.nan, 10.0]] * (len(distance) - 1)), "stopped": "no room"}
 
 
 def test_the_outcome_of_a_run_by_hand():
@@ -200,6 +207,7 @@ def test_the_outcome_of_a_run_by_hand():
     assert found["distance_m"] == pytest.approx([0.12, 0.02] + [0.05] * 9), "the present distance, not the best so far"
     assert found["others_shifted_m"] == pytest.approx(0.03), "of what was not to be moved, at its farthest"
     np.testing.assert_allclose(found["angles_deg"], [[40], [10]])
+    assert found["stopped"] == "no room"
 
 
 def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypatch):
@@ -222,12 +230,12 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
 
 
 def test_the_experiment_asks_for_every_scene_and_every_try(tmp_path, monkeypatch):
-    def run_all(function, tasks, jobs):
+    def map(function, *tasks):
+        tasks = list(zip(*tasks))
         assert len(set(tasks)) == len(tasks) == 6 * 3 * 6 + 2 * 3 * 5
         assert {task[2] for task in tasks if task[1]} == {0, 1, 2, 3, 4, 6}, "not the seed of the training pokes"
-        return {task: tables.outcome(record([0.1, 0.05])) for task in tasks}
-    monkeypatch.setattr(tables, "run_all", run_all)
-    figures, curves = tables.reproduce_planning(tmp_path, "run.npz", scenes=6)
+        return [tables.outcome(record([0.1, 0.05])) for task in tasks]
+    figures, curves = tables.reproduce_planning(tmp_path, "run.npz", 6, map)
     assert curves["oracle", 3].shape == (6, 11) and figures["learned_1_left"] == pytest.approx(0.5)
 
 
@@ -245,6 +253,7 @@ def test_summary_of_the_control_experiment_by_hand():
     figures, curves = tables.summarise_planning(found)
     assert curves["learned", 1].shape == (2, 11)
     for name, value in {"learned_2_left": 0.06 / 0.4, "learned_2_left_sd": (0.4 - 0.02 / 0.3) / np.sqrt(2),
+                        "learned_2_worst": 0.4, "plan_worst_scene": 0.4,
                         "plan_over_oracle": 2, "learned_1_angle_start_deg": 20, "learned_1_angle_deg": 8,
                         "learned_obstacle_avoided": 2 / 3, "greedy_obstacle_avoided": 1 / 3,
                         "greedy_obstacle_shift_cm": 5 / 3}.items():

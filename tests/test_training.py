@@ -288,11 +288,6 @@ def test_a_checkpoint_that_does_not_fit_names_what_differs(tmp_path, spoil, said
         checkpoints.load_run(path)
 
 
-def test_a_checkpoint_of_another_camera_is_refused():
-    with pytest.raises(ValueError, match="another camera"):
-        train(tiny_pokes(cam=camera(x=0.1)), random_run())
-
-
 @pytest.mark.parametrize("name, bad, said", [
     ("steps", 0, "whole number >= 1"), ("steps", np.nan, "whole number"), ("batch", 2.5, "whole number"),
     ("warmup", -1, "whole number >= 0"), ("seed", -1, "whole number >= 0"), ("learning_rate", 0.0, "> 0"),

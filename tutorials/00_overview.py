@@ -39,7 +39,7 @@ import numpy as np
 
 from hind4sight_min import geometry, losses, networks, training
 from hind4sight_min.disk import checkpoints
-from hind4sight_min.lab.figures import RED, blend, draw_arrow, flow_to_rgb, on_table, show_image
+from hind4sight_min.lab.figures import RED, blend, draw_arrow, draw_wheel, on_table, show_flow, show_image
 
 options = lesson.begin("00_overview")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -135,13 +135,14 @@ show_image(axes[1, 0], after.images[0], "$I_{t+1}$")
 masks = answer.masks.reshape(*shape, -1)
 show_image(axes[0, 1], blend(before.images[0], masks[..., 1:]), "masks $m^1, m^2$; grey: $m^0$")
 show_image(axes[1, 1], np.clip(warped[0], 0, 1), "$I'_t$: $I_{t+1}$ warped back")
-show_image(axes[0, 2], flow_to_rgb(flow[0], longest), f"$(U, V)$, up to {longest:.0f} px")
+show_flow(axes[0, 2], flow[0], longest, "$(U, V)$")
+draw_wheel(axes[0, 2], longest, low=False)
 moves = np.flatnonzero(np.linalg.norm(scene_flow[0], axis=1) > 0.002)[::4]  # arrows of some of them
 axes[1, 2].scatter(*before.points[0, :, :2].T, s=5, c=before.images.reshape(-1, 3), linewidths=0)
 axes[1, 2].quiver(*before.points[0, moves, :2].T, *scene_flow[0, moves, :2].T, color=RED, angles="xy",
                   scale_units="xy", scale=1, width=0.008)
 axes[1, 2].set(aspect="equal", xlim=(-0.27, 0.27), ylim=(-0.26, 0.16), xticks=[], yticks=[])
-axes[1, 2].set_title("$P_t$ and $P'_{t+1} - P_t$ from above", fontsize=11)
+axes[1, 2].set_title("$P_t$ and $P'_{t+1}$ from above", fontsize=11)
 for panel, map_, name in zip(axes[:, 3], root, ("P' \\to P", "P \\to P'")):
     shown = show_image(panel, map_, f"$D_{{{name}}}$", vmax=max(1.0, *(each.max() for each in root)))
 figure.colorbar(shown, ax=axes[:, 3], label="$\\sqrt{D}$ [cm]", shrink=0.7)

@@ -157,7 +157,7 @@ x, y = cloud[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 
 view = {"aspect": "equal", "xlim": (x - 0.13, x + 0.13), "ylim": (y - 0.11, y + 0.11), "xlabel": "x [m]",
         "ylabel": "y [m]"}
 axes[2].set(**view)
-axes[2].set_title("the scene flow from above", fontsize=11)
+axes[2].set_title("the scene flow from above (grey: what stays)", fontsize=11)
 figure.suptitle("Two masks and two rigid motions describe all that this poke moved", fontsize=11)
 lesson.keep(options, figure, "masks")
 
@@ -297,7 +297,7 @@ for k, colour in enumerate(colours, 1):
     right.plot(history[..., 0], history[..., 1], color=colour, linewidth=0.7, alpha=0.5)
     right.plot(*history[-1].T, ".", color=colour, markersize=6, label=f"object {k}, and its way there")
 right.set(**view)
-right.set_title("the optimiser's way, point by point", fontsize=11)
+right.set_title("the optimiser's way, point by point (grey: what stays)", fontsize=11)
 right.legend(fontsize=9, loc="upper left")
 figure.suptitle("so3_exp keeps its digits down to zero, so an optimiser can start there and find both motions",
                 fontsize=11)

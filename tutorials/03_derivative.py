@@ -195,7 +195,7 @@ away = np.array([-0.8, 0.8])
 for slope, colour, name in ((left, ORANGE, "slope to the left"), (right, RED, "slope to the right"),
                             (mean_slope, BLUE, "central difference")):
     axes[1].plot(3 + away, row[3] + slope * away, color=colour, linewidth=2, label=name)
-axes[1].set(xlabel="place x", ylabel="y", ylim=(0, 2))
+axes[1].set(xlabel="place x", ylabel="y", ylim=(0, 2.4))
 axes[1].set_title("a kink has no slope", fontsize=11)
 axes[1].legend(fontsize=9, ncols=2, loc="upper left")
 figure.suptitle("Two ways to be misled by a measured slope", fontsize=11)

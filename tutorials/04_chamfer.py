@@ -30,7 +30,7 @@ from autograd import grad
 
 from hind4sight_min import losses, ops
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import BLUE, GREEN, RED
+from hind4sight_min.lab.figures import BLUE, DISTANCES, GREEN, RED
 from hind4sight_min.lab.noise import add_depth_noise
 from hind4sight_min.training import scenes_of
 
@@ -93,7 +93,7 @@ figure, axes = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
 titles = ("no motion: $D_{P' \\to P}$", "no motion: $D_{P \\to P'}$", "true flow: $D_{P' \\to P}$",
           "true flow: $D_{P \\to P'}$")
 for panel, title, map_ in zip(axes, titles, (*still_maps, *true_maps)):
-    shown = panel.imshow(100 * np.sqrt(map_[0].reshape(shape)), cmap="viridis", vmin=0, vmax=4)
+    shown = panel.imshow(100 * np.sqrt(map_[0].reshape(shape)), cmap=DISTANCES, vmin=0, vmax=4)
     panel.set_title(title, fontsize=11)
     panel.set_xticks([])
     panel.set_yticks([])
@@ -134,20 +134,23 @@ print(f"3. Of the arrows on the object, {share:.0%} are within 60 degrees of its
       "get an arrow.")
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", sharex=True, sharey=True)
-x, y = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
-for panel, arrows, title, colour in ((left, pull / 4, "minus the gradient of Eq. (2), a quarter as long", BLUE),
-                                     (right, true_flow, "the true scene flow", RED)):
+middle = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
+ends = np.concatenate([before[0, on_object] + each[on_object] for each in (0 * pull, pull / 8, true_flow)])[:, :2]
+for panel, arrows, title, colour in ((left, pull / 8, "minus the gradient of Eq. (2), an eighth as long", BLUE),
+                                     (right, true_flow, "the true scene flow, true to length", RED)):
     panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P_t$", linewidths=0)
     panel.scatter(*after[0, next_counted[0] & (after[0, :, 2] > 0.01), :2].T, s=16, marker="x", color=GREEN,
                   label="second cloud $P_{t+1}$, objects and walls only", linewidths=1)
     panel.quiver(*before[0, on_object, :2].T, *arrows[on_object, :2].T, color=colour, angles="xy", scale_units="xy",
-                 scale=1, width=0.005)
-    panel.set(aspect="equal", xlim=(x - 0.13, x + 0.13), ylim=(y - 0.10, y + 0.10), xlabel="x [m]", ylabel="y [m]")
+                 scale=1, width=0.005, label=title)
+    panel.set(aspect="equal", xlim=(ends[:, 0].min() - 0.02, ends[:, 0].max() + 0.02),  # every arrow ends in the frame
+              ylim=(ends[:, 1].min() - 0.02, ends[:, 1].max() + 0.02), xlabel="x [m]", ylabel="y [m]")
     panel.set_title(title, fontsize=11)
 total = pull[on_object].mean(axis=0)
-left.quiver(x, y, *total[:2], color="black", angles="xy", scale_units="xy", scale=1, width=0.012, zorder=5,
-            label="their mean, true to length")
-left.legend(fontsize=8, loc="lower right")
+left.quiver(*middle, *total[:2], color="black", angles="xy", scale_units="xy", scale=1, width=0.012, zorder=5,
+            label="the mean of these arrows, not shortened")
+handles = {each.get_label(): each for panel in (left, right) for each in panel.collections}
+figure.legend(handles.values(), handles.keys(), fontsize=9, ncols=3, loc="outside lower center")
 figure.suptitle("Seen from above: single points are pulled to the nearest edge; only the object as a whole is pulled "
                 "right", fontsize=11)
 lesson.keep(options, figure, "gradient")

@@ -25,11 +25,12 @@ import lesson  # first of all: it sets the number of BLAS threads
 import autograd.numpy as anp
 import numpy as np
 from autograd import grad
+from matplotlib.patheffects import withStroke
 from scipy.ndimage import map_coordinates
 
 from hind4sight_min import geometry, losses
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import BLUE, RED, colour_wheel, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, DISTANCES, ERRORS, RED, colour_wheel, flow_to_rgb
 from hind4sight_min.training import scenes_of
 
 options = lesson.begin("05_warping")
@@ -126,10 +127,11 @@ counted = (shared.reshape(1, *shape) & in_view)[0]
 errors = [np.where(counted, np.abs(image - losses.warp_backward(next_image, flow)[0])[0].sum(axis=-1), np.nan)
           for flow in flows.values()]
 window = np.s_[14:48, 18:52]  # around the object
-grey = plt.get_cmap("magma").with_extremes(bad="0.6")
+grey = plt.get_cmap(ERRORS).with_extremes(bad="0.6")
 figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
 panels = [("$I_t$, before", image[0]), ("$I_{t+1}$, after", next_image[0]),
-          (f"true optical flow (wheel: {length.max():.0f} px)", flow_to_rgb(flows["the true flow"][0], length.max())),
+          (f"true optical flow (the wheel's rim: {length.max():.0f} px)",
+           flow_to_rgb(flows["the true flow"][0], length.max())),
           ("$I'_t$: $I_{t+1}$ warped back along it", np.clip(warped[0], 0, 1)),
           (f"$|I_t - I_{{t+1}}|$, no motion: loss {costs['no motion']:.1f}", errors[0]),
           (f"$|I_t - I'_t|$, true flow: loss {costs['the true flow']:.1f}", errors[1])]
@@ -231,12 +233,13 @@ figure, axes = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained", share
 for panel, i, title, label in ((axes[0], 0, "photometric loss, Eq. (3)", "loss"),
                                (axes[1], 1, "Chamfer distance, Eq. (2)", "cm$^2$")):
     half = 100 * (offsets[-1] + (offsets[1] - offsets[0]) / 2)
-    shown = panel.imshow(landscape[..., i], origin="lower", extent=(-half, half, -half, half), cmap="viridis")
+    shown = panel.imshow(landscape[..., i], origin="lower", extent=(-half, half, -half, half), cmap=DISTANCES)
     rim = 100 * np.concatenate([[2 * offsets[0] - offsets[1]], offsets, [2 * offsets[-1] - offsets[-2]]])
     panel.contour(rim, rim, np.pad(basins[i], 1).astype(float), levels=[0.5], colors="white", linewidths=2)
     panel.plot(0, 0, "+", color="white", markersize=12, markeredgewidth=2)
     panel.plot(*100 * start[:2], "o", color=RED, markeredgecolor="white", markersize=9)
-    panel.annotate("no motion", 100 * start[:2], (8, 4), textcoords="offset points", color="white", fontsize=10)
+    panel.annotate("no motion", 100 * start[:2], (8, 4), textcoords="offset points", color="white", fontsize=10,
+                   path_effects=[withStroke(linewidth=2, foreground="black")])
     panel.set(xlabel="offset in x [cm]")
     panel.set_title(f"{title}: basin {shares[i]:.0%} of the offsets", fontsize=11)
     figure.colorbar(shown, ax=panel, label=label)

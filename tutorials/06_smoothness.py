@@ -30,7 +30,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from hind4sight_min import geometry, losses, training
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import BLUE, GREEN, PINK, RED, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, DISTANCES, SHARES, TERM_COLOURS, RED, draw_wheel, flow_to_rgb
 
 options = lesson.begin("06_smoothness")
 import matplotlib.pyplot as plt  # after begin(), which chooses whether there are windows
@@ -138,12 +138,13 @@ figure, axes = plt.subplots(2, 3, figsize=(11, 5.9), layout="constrained")
 axes[0, 0].imshow(poke.before.images[0][window])
 axes[0, 0].set_title("the picture $I_t$", fontsize=11)
 for panel, weights, name in ((axes[0, 1], across, "to the right"), (axes[0, 2], down, "down")):
-    shown = panel.imshow(weights[0][window], cmap="cividis", vmin=0, vmax=1)
+    shown = panel.imshow(weights[0][window], cmap=SHARES, vmin=0, vmax=1)
     panel.set_title(f"weight of a step {name}", fontsize=11)
 figure.colorbar(shown, ax=axes, label="$e^{-40 |\\nabla I_t|}$", shrink=0.48, anchor=(0, 1))
 for panel, name in zip(axes[1], list(flows)[1:]):
     panel.imshow(flow_to_rgb(flows[name][0], longest)[window])
     panel.set_title(f"{name}: $L_{{fs}}$ = {costs[name]:.0f} px", fontsize=11)
+draw_wheel(axes[1, 0], longest, low=True)
 for panel in axes.flat:
     panel.set(xticks=[], yticks=[])
 figure.suptitle("Steps are nearly free at the object's rim and stripes (dark) and cost in full on the table (bright)",
@@ -281,7 +282,7 @@ print(f"   of what the true flow saves in L_CD, the one with a hole saves {gains
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.9), layout="constrained")
 for column, (name, (values, maps)) in zip(axes.T, results.items()):
     for panel, map_, symbol in zip(column, maps, ("P' \\to P", "P \\to P'")):
-        shown = panel.imshow(100 * np.sqrt(map_[0].reshape(shape))[window], cmap="viridis", vmin=0, vmax=2)
+        shown = panel.imshow(100 * np.sqrt(map_[0].reshape(shape))[window], cmap=DISTANCES, vmin=0, vmax=2)
         panel.set(xticks=[], yticks=[])
         panel.set_title(f"{name}: $D_{{{symbol}}}$", fontsize=11)
     column[1].set_xlabel(f"$L_{{CD}}$ = {1e4 * values[0]:.0f} cm$^2$, $L_{{ds}}$ = {1e4 * values[1]:.0f} cm$^2$")
@@ -301,18 +302,18 @@ factors = curves / curves[:, -1:]
 medians = np.median(factors, axis=0)  # (shares, terms)
 wins = float((factors[:, 0, 1] > factors[:, 0, 0]).mean())
 rise = (curves[:, 0] - curves[:, -1]).mean(axis=0)
-styles = {"chamfer": ("$L_{CD}$, Eq. (2)", BLUE, "o-"),
-          "distance_smoothness": ("$L_{ds}$, Eq. (5)", RED, "s-"),
-          "photometric": ("$L_{rec}$, Eq. (3)", GREEN, "^-"),
-          "flow_smoothness": ("$L_{fs}$, Eq. (4)", PINK, "d-")}
+styles = {"chamfer": ("$L_{CD}$, Eq. (2)", "o-"),
+          "distance_smoothness": ("$L_{ds}$, Eq. (5)", "s-"),
+          "photometric": ("$L_{rec}$, Eq. (3)", "^-"),
+          "flow_smoothness": ("$L_{fs}$, Eq. (4)", "d-")}
 print(f"6. What a hole does to each loss, {len(group)} pokes: median factor; mean rise times its weight in training")
 for i, key in enumerate(styles):
     print(f"   {key}: {medians[0, i]:.2f}; {training.WEIGHTS[key] * rise[i]:.2f}")
 print(f"   the factor of L_ds is larger than that of L_CD in {wins:.0%} of the pokes")
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
-for i, (name, colour, style) in enumerate(styles.values()):
-    axes[0].plot(100 * shares, medians[:, i], style, color=colour, label=name)
+for i, (key, (name, style)) in enumerate(styles.items()):
+    axes[0].plot(100 * shares, medians[:, i], style, color=TERM_COLOURS[key], label=name)
 axes[0].set(xlabel="how far the core moves [% of its true motion]", ylabel="loss / loss without a hole")
 axes[0].legend(fontsize=9)
 axes[0].set_title(f"as the hole closes, median of {len(group)} pokes", fontsize=11)

@@ -33,10 +33,11 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from hind4sight_min import interactions, scene
 from hind4sight_min.geometry import poke_frame, project, unproject
 from hind4sight_min.lab.evaluation import MOVING
-from hind4sight_min.lab.figures import BLUE, ORANGE, OUTLINE, RED
+from hind4sight_min.lab.figures import BLUE, DISTANCES, ORANGE, OUTLINE, RED, SHARES
 from hind4sight_min.lab.noise import add_depth_noise
 from hind4sight_min.sim.arena import Arena, Settings
 from hind4sight_min.sim.collection import collect_shard
+from hind4sight_min.sim.photographs import photographs
 from hind4sight_min.sim.truth import true_scene_flow
 from hind4sight_min.training import scenes_of
 
@@ -58,6 +59,9 @@ import matplotlib.pyplot as plt  # after begin(), which chooses whether there ar
 # at. The robot has no film: it takes one picture before the poke and one after.
 
 # %%
+FILMED = 40  # steps of 1/240 s from one picture of the film to the next
+
+
 class FilmedArena(Arena):
     """An arena that also keeps pictures of what happens during a poke."""
     film, steps = (), 0
@@ -66,7 +70,7 @@ class FilmedArena(Arena):
         for _ in range(count):
             super()._step(1)
             self.steps += 1
-            if self.film and self.steps % 40 == 0:
+            if self.film and self.steps % FILMED == 0:
                 self.film.append(self.observe()[0])
 
 
@@ -80,10 +84,11 @@ try:
         film = [*arena.film, arena.observe()[0]]
         camera, settings, bullet = arena.camera, asdict(arena.settings), True
 except RuntimeError as error:
-    print(f"   NOTE: {error}\n   The shipped pokes of data_small are used instead; there is no film.")
+    print(f"   NOTE: {error}\n   The shipped pokes of data_small are used instead; in place of a film, photographs.")
     recorded, truth = lesson.pokes()
     rgb, depth, labels = recorded.rgb_before[1], recorded.depth_before[1], truth.labels[1]
-    poke, start, film, at_rest = recorded.pokes[1], recorded.starts[1], [rgb, recorded.rgb_after[1]], True
+    poke, start, at_rest = recorded.pokes[1], recorded.starts[1], True
+    film = list(photographs(recorded, truth, [1])[1])
     camera, settings, empty_depth, bullet = recorded.camera, recorded.settings, recorded.empty_depth, False
 print(f"1. A poke from ({start[0]:.2f}, {start[1]:.2f}) m to ({poke[0]:.2f}, {poke[1]:.2f}) m, direction "
       f"{np.degrees(poke[2]):.0f} degrees; then everything {'came to rest' if at_rest else 'kept moving'}.")
@@ -133,10 +138,10 @@ path = np.array([[*start, 0.02], [*poke[:2], 0.02]])  # 2 cm above the table, m
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.7), layout="constrained", width_ratios=(1.2, 1.5, 1.2, 1.25))
 picture(axes[0], rgb, "the scene and the poke")
 arrow(axes[0], *project(path, camera))
-shown = picture(axes[1], 100 * (empty_depth - seen), "empty depth minus depth", cmap="viridis", vmin=0, vmax=6)
+shown = picture(axes[1], 100 * (empty_depth - seen), "empty depth minus depth", cmap=DISTANCES, vmin=0, vmax=6)
 figure.colorbar(shown, ax=axes[1], label="[cm]", shrink=0.65)
-picture(axes[2], occupied, "occupied pixels", cmap="cividis")
-axes[3].imshow(cells, origin="lower", extent=(-half, half, -half, half), cmap="cividis", interpolation="nearest")
+picture(axes[2], occupied, "occupied pixels", cmap=SHARES)
+axes[3].imshow(cells, origin="lower", extent=(-half, half, -half, half), cmap=SHARES, interpolation="nearest")
 for radius in settings["poke_length"]:
     axes[3].add_patch(Circle(poke[:2], radius, fill=False, color="white", linestyle=":", linewidth=1.2))
 arrow(axes[3], start, poke[:2])
@@ -148,15 +153,16 @@ lesson.keep(options, figure, "grid")
 
 middle, size = project(np.array([*poke[:2], 0.02]), camera), np.array([camera.width, camera.height]) // 2
 left, top = np.clip(middle - size / 2, 0, size).astype(int)
-part = np.s_[top:top + size[1], left:left + size[0]]  # half the picture, around the target
-figure, axes = plt.subplots(1, len(film), figsize=(11, 9.6 / len(film) + 0.6), layout="constrained")
+fine = len(film[0]) // camera.height  # a photograph has more pixels than the camera of the model
+part = np.s_[fine * top:fine * (top + size[1]), fine * left:fine * (left + size[0])]  # half of it, around the target
+figure, axes = plt.subplots(1, len(film), figsize=(11, 2.4) if bullet else (8, 3.5), layout="constrained")
 for number, (panel, frame) in enumerate(zip(axes, film)):
     ends = number in (0, len(film) - 1)
-    picture(panel, frame[part], ("before" if number == 0 else "after") if ends else "during the poke")
+    picture(panel, frame[part], ("before" if number == 0 else "after") if ends else f"{number * FILMED / 240:.2f} s")
     for line in panel.spines.values():
         line.set(color=RED if ends else "0.8", linewidth=4)
-figure.suptitle("The finger (white cylinder) pushes and is lifted; the robot keeps the two framed pictures only"
-                if bullet else "All that the robot keeps of a poke: a picture before and one after", fontsize=11)
+figure.suptitle("The finger (white cylinder) pushes and is lifted; the robot keeps the framed two, in 64 x 48 pixels"
+                if bullet else "All that the robot keeps of a poke: before and after, in 64 x 48 pixels", fontsize=11)
 lesson.keep(options, figure, "film")
 
 # %% [markdown]

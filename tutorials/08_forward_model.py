@@ -33,7 +33,7 @@ import numpy as np
 from hind4sight_min import geometry, networks, training
 from hind4sight_min.disk import checkpoints
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import BLUE, blend, draw_arrow, flow_to_rgb
+from hind4sight_min.lab.figures import BLUE, SHARES, blend, draw_arrow, draw_wheel, show_flow, show_image
 from hind4sight_min.scene import Scene, look
 
 options = lesson.begin("08_forward_model")
@@ -133,16 +133,13 @@ for name, (masks, _, scene_flow) in answers.items():
 
 figure, axes = plt.subplots(2, sizes.masks + 2, figsize=(11, 4.0), layout="constrained")
 for line, (name, (masks, flow, _)) in zip(axes, answers.items()):
-    line[0].imshow(image if name == "fresh" else flow_to_rgb(true_flow, longest))
-    line[0].set_title("before, and the poke" if name == "fresh" else "true optical flow", fontsize=10)
     for k in range(sizes.masks):
-        shown = line[k + 1].imshow(masks[0, ..., k], cmap="viridis", vmin=0, vmax=1)
-        line[k + 1].set_title(f"{name}: mask $m^{k}$", fontsize=10)
-    line[-1].imshow(flow_to_rgb(flow[0], longest))
-    line[-1].set_title(f"{name}: optical flow", fontsize=10)
+        shown = show_image(line[k + 1], masks[0, ..., k], f"{name}: mask $m^{k}$", cmap=SHARES, vmin=0, vmax=1)
+    show_flow(line[-1], flow[0], longest, f"{name}: optical flow")
+show_image(axes[0, 0], image, "before, and the poke")
+show_flow(axes[1, 0], true_flow, longest, "true optical flow")
+draw_wheel(axes[1, 0], longest, low=False)
 poke_arrow(axes[0, 0], data.starts[ROW], data.pokes[ROW])
-for panel in axes.flat:
-    panel.set(xticks=[], yticks=[])
 figure.colorbar(shown, ax=axes, label="share of each point", shrink=0.8)
 figure.suptitle("Before training: nearly the same masks wherever it looks, no motion. After it: masks on what moves",
                 fontsize=11)
@@ -183,7 +180,7 @@ for poke in range(4):
                          scale_units="xy", scale=1, width=0.008)
     axes[1, poke].set(aspect="equal", xlim=(-0.25, 0.25), ylim=(-0.18, 0.20), xlabel="x [m]")
 axes[1, 0].set_ylabel("y [m]")
-figure.suptitle("One scene, four imagined pokes: the masks and the predicted motion (seen from above) follow the poke",
+figure.suptitle("One scene, four imagined pokes: masks and predicted motion (lower line, from above) follow the poke",
                 fontsize=11)
 lesson.keep(options, figure, "what_if")
 

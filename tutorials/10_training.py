@@ -186,9 +186,13 @@ for panel in axes:
     panel.axvline(0, color="0.5", linewidth=1)
     panel.set(xlabel="everything moved along the poke by [px]")
 axes[0].set(ylabel="change of the photometric loss")
+axes[0].set_title("a tenth of a pixel of motions", fontsize=11)
 axes[0].legend(fontsize=9)
 axes[1].set(xlim=(-0.0055, 0.0055), ylim=(-0.02, 0.08))
-axes[1].set_title("the same, near no motion", fontsize=11)
+axes[1].set_title("the same, enlarged ten times: what the left picture hides", fontsize=11)
+dip = change[1].argmin()
+axes[1].annotate(f"a dip of {-change[1, dip]:.3f} at {SHIFTS[dip]:.3f} px:\nthe object's gain", 
+                 (SHIFTS[dip], change[1, dip]), (0.0012, 0.03), fontsize=9, arrowprops={"arrowstyle": "->"})
 figure.suptitle("A kink at no motion holds everything in place; a little noise rounds it off", fontsize=11)
 lesson.keep(options, figure, "kink")
 

@@ -205,13 +205,14 @@ for panel, name, title, top in ((axes[0], "flow_mse_ratio", "squared flow error 
                                 (axes[1], "mask_iou", "IoU of the masks", 1.0),
                                 (axes[2], "inverse_target_cm", "median target error [cm]", 40)):
     for (model, seed), found in small.items():
-        panel.plot(places[model], found[name], "o", color=(BLUE, RED)[seed], markersize=9)
+        panel.plot(places[model], found[name], "oD"[seed], color=(BLUE, RED)[seed], markersize=(12, 6)[seed],
+                   clip_on=False)
     panel.axhline(metrics[name], color="black", linestyle="--", linewidth=1)
     panel.set_xticks(list(places.values()), [tables.MODELS[model][0] for model in places])
     panel.set(ylim=(0, top), xlim=(-0.5, 2.5))
     panel.set_title(title, fontsize=11)
 for seed in SEEDS:
-    axes[1].plot([], [], "o", color=(BLUE, RED)[seed], label=f"seed {seed}")
+    axes[1].plot([], [], "oD"[seed], color=(BLUE, RED)[seed], markersize=(12, 6)[seed], label=f"seed {seed}")
 axes[1].plot([], [], "k--", linewidth=1, label="shipped model")
 axes[1].legend(fontsize=9, loc="center left")
 figure.suptitle(f"After {STEPS} steps: 2D alone has hardly begun; 3D and full are far from what they can be",

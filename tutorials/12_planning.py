@@ -30,7 +30,7 @@ from hind4sight_min.disk import checkpoints
 from hind4sight_min.geometry import project
 from hind4sight_min.lab import control, figures
 from hind4sight_min.lab.evaluation import true_motion
-from hind4sight_min.lab.figures import BLUE, PINK, RED, YELLOW
+from hind4sight_min.lab.figures import BLUE, PINK, RED, SHARES, YELLOW
 from hind4sight_min.lab.marks import points_at
 
 options = lesson.begin("12_planning")
@@ -145,7 +145,7 @@ for i, (panel, (ends, costs)) in enumerate(zip(axes, rounds)):
     panel.plot(*marks.T, "o", markersize=9, fillstyle="none", color=YELLOW, markeredgewidth=2)
     panel.plot(*goal.pixels.T, "*", markersize=11, color=YELLOW, markeredgecolor="black")
     for j in possible:
-        colour = plt.get_cmap("cividis")(1 - np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1))
+        colour = plt.get_cmap(SHARES)(1 - np.clip((costs[j] - low) / max(high - low, 1e-9), 0, 1))
         panel.plot(*ends[j].T, color=colour, linewidth=1.2)
         panel.plot(*ends[j, 1], ".", color=colour, markersize=5)
     figures.draw_arrow(panel, *ends[possible[-1]])
@@ -158,22 +158,23 @@ lesson.keep(options, figure, "population")
 # ## The closed loop
 #
 # The world does not do quite what the model says. So only the first poke is carried out; then the robot looks again
-# and plans anew, until the goal is reached, no poke is predicted to help, or the pokes are spent. Between two pictures
-# it must find the marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's
-# mask and corrects it by registering the two pictures.
+# and plans anew, until no poke is predicted to help or the pokes are spent. Between two pictures it must find the
+# marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's mask and corrects
+# it by registering the two pictures. Pokes under which something would pass through something else are ruled out
+# (`lab.control.careful`): what a pushed object meets next, the model sees less well.
 
 # %%
 if simulator:
     BUDGET = 2 + 4 * MOVERS
     with control.random_task(0, MOVERS) as task:
-        record = control.closed_loop(task, run, "learned", SEARCH, BUDGET, seed=0)
+        record = control.photographed(control.closed_loop(task, run, "learned", SEARCH, BUDGET, seed=0), task)
     with control.random_task(0, MOVERS) as task:  # the same scene again
         random = control.closed_loop(task, run, "random", SEARCH, BUDGET, seed=0)
     left, lost = (each["distance"].mean(axis=1) for each in (record, random))
     print(f"4. {len(record['pokes'])} planned pokes: " + " -> ".join(f"{100 * d:.1f}" for d in left)
           + " cm from the goal")
     figure, (first, second) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-    first.imshow(record["rgb"][-1])
+    first.imshow(record["photographs"][-1], extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5))
     first.set_title("after the last poke: mark (ring) and its goal (star)", fontsize=11)
     first.plot(*project(record["marks"][-1], camera).T, "o", markersize=12, fillstyle="none", color=YELLOW,
                markeredgewidth=2)

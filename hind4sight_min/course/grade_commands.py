@@ -3,9 +3,12 @@ import hashlib
 import os
 import secrets
 import stat
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 from ..disk.files import write_text
+from ..lab.processes import cluster_map
 from . import ASSIGNMENTS, assignment_of, grading, sandbox
 
 
@@ -33,9 +36,17 @@ def run_grade(args):
         raise ValueError(f"--csv: expected a file outside of {args.all}, where what lies beside it is a student's")
     expect_pokes(assignment_of(args.assignment), args)
     seed = args.seed or kept_seed(grading.results_folder(args.csv) / "seed")
-    how = grading.How(seed_from(seed), pokes=args.pokes)
-    rows = grading.grade_all(args.all, assignment_of(args.assignment), how, args.csv, args.jobs, print_row)
+    how = grading.How(seed_from(seed), pokes=args.pokes and os.path.abspath(args.pokes))
+    with (cluster_map(args.cluster) if args.cluster else threads_map(args.jobs)) as map:
+        rows = grading.grade_all(args.all, assignment_of(args.assignment), how, args.csv, map, print_row)
     print(f"{args.csv}: {len(rows)} students")
+
+
+@contextmanager
+def threads_map(jobs):
+    """A `map` over threads: what students wrote runs in processes of its own anyway."""
+    with ThreadPoolExecutor(jobs) as pool:
+        yield pool.map
 
 
 def expect_pokes(assignment, args):

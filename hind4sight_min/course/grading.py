@@ -8,16 +8,12 @@ import codecs
 import csv
 import hashlib
 import io
-import json
 import os
 import random
 import re
 import stat
-import threading
 import tokenize
 import zipfile
-from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -25,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..disk.files import write_json, write_text
+from ..disk.files import read_json, write_json, write_text
 from . import blank, bugs, improve, sandbox
 from .assignments import a8_improve
 from .task import Answer, judge
@@ -358,49 +354,58 @@ def write_csv(path, rows):
     write_text(path, text.getvalue())
 
 
-def grade_all(folder, assignment, how, out, jobs=2, on_student=None):
+def finished(path):
+    """The results in a file; None where there are none, or not yet all."""
+    try:
+        results = read_json(path)
+        return results if results["extra_data"]["finished"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def grade_once(name, how, path, content, note):
+    """Grade a submission to the assignment `name` unless `path` has its finished results -> the results, the note."""
+    results = None if content is None else finished(path)
+    if results:
+        return results, note
+    try:
+        return grade(items_of(assignment_of(name), how), content, path, note=note), note
+    except Exception as error:  # ours, as where the sandbox could not begin: not the student's fault
+        return read_json(path), f"NOT GRADED: {error}"
+
+
+def grade_all(folder, assignment, how, out, map=map, on_student=None):
     """Grade a folder of submissions -> rows, dicts, of the CSV file `out`, which is rewritten whole after each.
 
     Not in the paper: grading. What is finished lies beside it in OUT_results/, by the hash of the submission and of how
     it was graded: started again, only what is missing is done. Students who hand in the same bytes share a grade. What
     goes by a figure has OUT_leaderboard.csv too, the best first.
-    on_student(row, results) is called after each.
+    map: as Python's; that of an executor grades several at a time. on_student(row, results) is called after each.
     """
-    out, items, waiting, rows = Path(out), items_of(assignment, how), students(folder), {}
-    kept, locks, places = results_folder(out), defaultdict(threading.Lock), []
-
-    def one(name):
-        content, note, where, attempts = None, "", "", len(waiting[name])
+    out, kept, about, todo, rows, places = Path(out).absolute(), results_folder(out).absolute(), [], {}, [], []
+    for name, attempts in students(folder).items():
+        content, note, where, count = None, "", "", len(attempts)
         try:
-            content, where, inside = find_submission(waiting[name][-1], f"{assignment.name}.py")
-            attempts += inside - 1
+            content, where, inside = find_submission(attempts[-1], f"{assignment.name}.py")
+            count += inside - 1
             key = hashlib.sha256(f"{assignment.number} {how.seed} {how.pokes}\n".encode() + content).hexdigest()[:20]
         except Exception as error:  # also a folder too deep to walk through
             note, key = sandbox.one_line(error), hashlib.sha256(os.fsencode(name)).hexdigest()[:20]
-        path = kept / f"{key}.json"
-        with locks[key]:
-            results = json.loads(path.read_text()) if content is not None and path.is_file() else None
-            if not (results and results["extra_data"]["finished"]):
-                try:
-                    results = grade(items, content, path, note=note)
-                except Exception as error:  # ours, as where the sandbox could not begin: not the student's fault
-                    note, results = f"NOT GRADED: {error}", json.loads(path.read_text())
-        row = {"student": as_cell(name), "score": results["score"], "of": total_of(results), "attempts": attempts,
-               "file": as_cell(where), "note": as_cell(note), "results": path.name,
-               **{test["name"].split()[0]: test["score"] for test in results["tests"]}}
-        return row, results
-
-    with ThreadPoolExecutor(jobs) as pool:
-        running = {pool.submit(one, name): name for name in waiting}
-        for done in as_completed(running):
-            row, results = done.result()
-            rows[running[done]] = row
-            write_csv(out, [rows[name] for name in waiting if name in rows])
-            places += [{"student": row["student"], each["name"]: each["value"]}
-                       for each in results.get("leaderboard", ())]
-            if places:
-                name = [*places[0]][1]
-                write_csv(out.with_name(f"{out.stem}_leaderboard.csv"), sorted(places, key=lambda place: place[name]))
-            if on_student:
-                on_student(row, results)
-    return [rows[name] for name in waiting]
+        about.append((name, count, where, kept / f"{key}.json"))
+        todo.setdefault(kept / f"{key}.json", (content, note))
+    graded, found = map(partial(grade_once, assignment.name, how), todo, *zip(*todo.values())), {}
+    for name, count, where, path in about:
+        if path not in found:
+            found[path] = next(graded)  # in the same order
+        results, note = found[path]
+        rows.append({"student": as_cell(name), "score": results["score"], "of": total_of(results), "attempts": count,
+                     "file": as_cell(where), "note": as_cell(note), "results": path.name,
+                     **{test["name"].split()[0]: test["score"] for test in results["tests"]}})
+        write_csv(out, rows)
+        places += [{"student": as_cell(name), each["name"]: each["value"]} for each in results.get("leaderboard", ())]
+        if places:
+            figure = [*places[0]][1]
+            write_csv(out.with_name(f"{out.stem}_leaderboard.csv"), sorted(places, key=lambda place: place[figure]))
+        if on_student:
+            on_student(rows[-1], results)
+    return rows

@@ -8,7 +8,7 @@ from ..networks import Sizes, init_parameters
 from ..training import Recipe, Run
 from .files import load_npz, save_npz
 
-FORMAT = "hind4sight_min checkpoint 5"
+FORMAT = "hind4sight_min checkpoint 6"
 MOST_BYTES = 200e6  # the largest Sizes, with the optimiser's state
 
 

@@ -2,9 +2,10 @@
 import json
 import math
 import os
+import re
 import socket
 import sysconfig
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +24,22 @@ def shipped(path):
 
 
 @contextmanager
-def whole_file(path):
-    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not.
+def whole_file(path, new=False):
+    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not. new: or
+    when there is such a file already, be it by another process meanwhile.
 
     Raises OSError naming `path` where it cannot be written, be it only that the disk is full.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")  # the ending stays: libraries go by it
+    temporary = path.with_name(f".{this_process()}.{path.name}")  # the ending stays: libraries go by it
     try:
         yield temporary
-        os.replace(temporary, path)
+        if new:
+            with suppress(FileExistsError):
+                os.link(temporary, path)
+        else:
+            os.replace(temporary, path)
     except OSError as error:  # a full disk does not say of which file
         raise OSError(f"{path}: could not be written: {error.strerror or error}") from None
     finally:
@@ -51,25 +57,41 @@ def check_output(name, path, ending):
         raise ValueError(f"{name}: {path} is a link, a folder or a device; expected a plain file or a new name")
 
 
-# --- one process at a time ------------------------------------------------------------------------------------
+# --- several processes, perhaps of several machines ----------------------------------------------------------------
 
-def is_alive(process):
-    """Whether a process of this machine, by its number, still runs."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+def this_process():
+    """This process among those of all machines: NUMBER@MACHINE."""
+    return f"{os.getpid()}@{socket.gethostname()}"
+
+
+def is_dead(process):
+    """Whether a process, NUMBER@MACHINE, was one of this machine and has ended; of others nobody here can know."""
+    number, _, machine = process.partition("@")
+    if machine != socket.gethostname() or not number.isdecimal():
         return False
+    try:
+        os.kill(int(number), 0)
+    except (ProcessLookupError, OverflowError):
+        return True
     except PermissionError:  # another user's
         pass
-    return True
+    return False
+
+
+def clear_away(paths):
+    """Remove what dead processes of this machine left half written: of `paths`, those that `whole_file` calls so."""
+    for path in paths:
+        left = re.match(rf"\.(\d+@{re.escape(socket.gethostname())})\.", path.name)
+        if left and is_dead(left[1]):
+            path.unlink(missing_ok=True)
 
 
 @contextmanager
 def only_one(path):
-    """Within the block no other process works on `path`, a file or a folder of results: it would overwrite ours.
+    """Within the block no other process works on `path`, a file of results: it would overwrite ours.
 
-    A lock file beside it holds the number and the machine of our process. That of a dead one is taken over, and what
-    else dead ones left half written is removed. Raises ValueError naming the lock file where a process is at it.
+    A lock file beside it names our process. That of a dead one is taken over, and what else dead ones left half written
+    is removed. Raises ValueError naming the lock file where a process is at it.
     """
     path = Path(path).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,22 +99,33 @@ def only_one(path):
     for _ in range(2):
         try:
             with open(lock, "x") as file:
-                file.write(f"{os.getpid()} {socket.gethostname()}")
+                file.write(this_process())
             break
         except FileExistsError:
-            process, _, machine = lock.read_text().partition(" ")
-            if machine == socket.gethostname() and not is_alive(int(process)):
+            process = lock.read_text(errors="replace")[:99]
+            if is_dead(process):
                 lock.unlink(missing_ok=True)
     else:
-        raise ValueError(f"{path}: process {process} on {machine} is at work there; if it is not, remove {lock}")
+        raise ValueError(f"{path}: process {process} is at work there; if it is not, remove {lock}")
     try:
-        for half in [*path.parent.glob(f".*.{path.stem}.*"), *path.glob(".*.*")]:  # as `whole_file` calls them
-            process = half.name.split(".")[1]
-            if process.isdigit() and not is_alive(int(process)):
-                half.unlink(missing_ok=True)
+        clear_away(path.parent.glob(f".*.{path.stem}.*"))
         yield
     finally:
         lock.unlink(missing_ok=True)
+
+
+def claim(path, made):
+    """Keep in a new file what a folder's results are made of, plain JSON types; where there is one, compare.
+
+    Of any number of processes at once one writes it. Raises ValueError that says what differs.
+    """
+    with whole_file(path, new=True) as temporary:
+        temporary.write_text(as_json(made), encoding="utf-8")
+    found = read_json(path)
+    for name, value in plain(made).items():
+        if found.get(name) != value:
+            raise ValueError(f"{path}: {name}: expected what is there, {found.get(name)}, got {value}; choose another "
+                             "folder")
 
 
 # --- text and arrays --------------------------------------------------------------------------------------------
@@ -103,10 +136,30 @@ def write_text(path, text):
         temporary.write_text(text, encoding="utf-8")
 
 
+def as_json(figures):
+    """Plain JSON types as text for people too."""
+    return json.dumps(figures, indent=2, sort_keys=True) + "\n"
+
+
 def write_json(path, figures):
     """Write plain JSON types, whole or not at all; nothing for no path."""
     if path:
-        write_text(path, json.dumps(figures, indent=2, sort_keys=True) + "\n")
+        write_text(path, as_json(figures))
+
+
+def read_json(path, most=10 << 20):
+    """Read a dict of plain JSON types. Raises ValueError naming a file that is damaged, holds another thing or has more
+    than `most` bytes, OSError where there is none.
+    """
+    with open(path, "rb") as file:
+        content = file.read(most + 1)
+    try:
+        found = json.loads(content) if len(content) <= most else None
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: damaged or not one of our files")
+    return found
 
 
 def plain(value):

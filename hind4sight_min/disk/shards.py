@@ -16,8 +16,9 @@ DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
 
 
 def counts_of(depth):
-    """Depth in m as it is stored, uint16."""
-    return np.clip(np.round(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+    """Depth in m as it is stored, uint16: 0, missing, for what does not fit."""
+    counts = np.round(depth / DEPTH_UNIT)
+    return np.where((counts > 0) & (counts <= 65535), counts, 0).astype(np.uint16)
 
 
 def stamp(interactions):
@@ -76,18 +77,24 @@ def shards_in(folder):
     return shards
 
 
-def load_interactions(folder):
-    """All shards of a folder, joined -> Interactions. Raises ValueError unless they are of one data set: of the same
-    camera and empty arena, and collected with the same seed and settings.
+def parts_of(folder):
+    """The shards of a folder, in order, one after the other -> Interactions. Raises ValueError unless they are of one
+    data set: of the same camera and empty arena, and collected with the same seed and settings.
     """
-    paths = shards_in(folder)
-    parts = [load_shard(path) for path in paths]
-    first = parts[0]
-    for path, part in zip(paths, parts):
+    first = None
+    for path in shards_in(folder):
+        part = load_shard(path)
+        first = first or part
         for name in ("camera", "settings", "seed"):
             if part.meta.get(name) != first.meta.get(name):
                 raise ValueError(f"{path}: of another data set than the folder's first shard: its {name} differs")
         if not np.array_equal(part.empty_depth, first.empty_depth):
             raise ValueError(f"{path}: of another data set than the folder's first shard: its empty arena differs")
+        yield part
+
+
+def load_interactions(folder):
+    """All shards of a folder, joined -> Interactions. Raises ValueError as `parts_of`."""
+    parts = [*parts_of(folder)]
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POKE}
-    return Interactions(**joined, empty_depth=first.empty_depth, camera=first.camera, meta=first.meta)
+    return Interactions(**joined, empty_depth=parts[0].empty_depth, camera=parts[0].camera, meta=parts[0].meta)

@@ -1,9 +1,10 @@
-"""The `hind4sight` command: collect, train, evaluate, show, explore, plan, demo, reproduce, course; COMMAND --help."""
+"""The `hind4sight` command: collect, import, train, evaluate, show, explore, plan, demo and more; `COMMAND --help`."""
 import argparse
 import json
 import os
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,14 +14,17 @@ import numpy as np
 from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
-from ..disk.shards import load_interactions
+from ..disk.recordings import save_recording
+from ..disk.shards import load_interactions, parts_of
 from ..networks import Sizes
-from ..sim.arena import Settings
+from ..sim.arena import MIDDLE, Settings
+from ..sim.bodies import read_urdfs
 from ..sim.collection import collect
 from ..sim.objects import KINDS, TEXTURES
 from ..sim.photographs import photographs
 from ..sim.truth import find_truth
-from . import contact, control, evaluation, tables
+from . import cameras, contact, control, evaluation, tables
+from .camera_faults import ONE_SIDED, under_faults
 from .noise import under_noise
 from .processes import parallel_map
 from .runs import total, train_saving
@@ -92,27 +96,74 @@ def print_metrics(metrics):
 
 # --- commands ----------------------------------------------------------------------------------------------
 
+def drawn_from(args):
+    """The fields of Settings that say what lies in the arena: of --urdf and --scale, and of --kinds where there are."""
+    if args.scale != 1 and not args.urdf:
+        raise ValueError("--scale: expected --urdf with it, whose objects it scales")
+    kinds = getattr(args, "kinds", None) or (() if args.urdf else Settings.kinds)
+    return {"kinds": tuple(kinds), "own": read_urdfs(args.urdf, args.scale) if args.urdf else ()}
+
+
 def run_collect(args):
-    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], kinds=tuple(args.kinds),
-                        textures=tuple(args.textures), place_within=args.within, width=args.size[0],
-                        height=args.size[1])
+    settings = Settings(objects_min=args.objects[0], objects_max=args.objects[1], textures=tuple(args.textures),
+                        place_within=args.within, width=args.size[0], height=args.size[1], **drawn_from(args))
     began, show = time.perf_counter(), progress_line("collect")
-    with parallel_map(args.jobs) as map, only_one(args.out):
+    with parallel_map(args.jobs, args.cluster) as map:
         show(0, args.pokes)
-        counts = collect(args.out, args.pokes, args.seed, settings, map, show)
+        counts = collect(args.out, args.pokes, args.seed, settings, map, show, args.part)
     seconds = time.perf_counter() - began
     dropped = ", ".join(f"{count} {name}" for name, count in counts.items() if name != "kept" and count) or "none"
     print(f"{args.out}: {counts['kept']} pokes in {seconds:.1f} s; dropped: {dropped}")
     write_json(args.json, {"collect_seconds": seconds, **{f"pokes_{name}": count for name, count in counts.items()}})
 
 
-def new_run(interactions, weight=(), masks=Sizes.masks, width=Sizes.width, depth_noise=0.0, **given):
-    """A fresh Run as the options of `train` say."""
-    recipe = training.Recipe(**given, sizes=Sizes(masks=masks, width=width),
-                             weights={**training.WEIGHTS, **dict(weight)})
-    run = training.start_run(recipe, interactions)
-    run.meta["depth_noise"] = depth_noise
+def run_import(args):
+    with only_one(args.out):
+        found = cameras.import_recording(args.folder, args.out, tuple(args.size), progress_line("import"))
+    camera = found.pop("camera")
+    pose, table = camera.arena_from_camera, found["table"]
+    down = np.degrees(np.arcsin(-pose[2, 2]))
+    known = "told" if np.isnan(table) else f"its empty picture shows, {table:.0%} of it table"
+    print(f"{args.out}: {found['pokes']} pokes, {camera.width} x {camera.height} px\n"
+          f"  the camera, as {known}: {pose[2, 3]:.3f} m above the table, looking down at {down:.1f} degrees; a pixel "
+          f"is {1e3 * camera.pixel_size:.1f} mm wide there\n"
+          f"  {found['missing']:.0%} of the pixels have no depth; {found['met']:.0%} of the pokes end where something "
+          "stands")
+    write_json(args.json, {f"import_{name}": value for name, value in found.items() if np.isfinite(value)})
+
+
+def run_export(args):
+    with only_one(args.folder):
+        count = save_recording(args.folder, parts_of(args.data))
+    print(f"{args.folder}: {count} pokes; 'hind4sight import' takes them back")
+
+
+def new_run(interactions, weight=(), masks=None, width=None, depth_noise=0.0, camera_faults=False, start_from=None,
+            **given):
+    """A fresh Run as the options of `train` say; with start_from, a path, from the parameters of that checkpoint."""
+    if depth_noise and camera_faults:
+        raise ValueError("--depth-noise: --camera-faults has a noise of its own")
+    start = start_from and checkpoints.load_run(start_from)
+    sizes = start.recipe.sizes if start else Sizes()
+    asked = replace(sizes, masks=masks or sizes.masks, width=width or sizes.width)
+    if start and asked != sizes:
+        raise ValueError(f"--start-from: {start_from} has {sizes.masks} masks and a width of {sizes.width}, expected "
+                         f"{asked.masks} and {asked.width}")
+    run = training.start_run(training.Recipe(**given, sizes=asked, weights={**training.WEIGHTS, **dict(weight)}),
+                             interactions)
+    run.meta.update(depth_noise=depth_noise, camera_faults=camera_faults)
+    if start:
+        run.vector = start.vector
+        run.meta["started_from"] = start.meta.get("data")  # the data set its parameters were trained on
     return run
+
+
+def objective_of(run):
+    """What a run minimises, as the options of `train` said."""
+    if run.meta.get("camera_faults"):
+        return under_faults
+    noise = run.meta.get("depth_noise")
+    return partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
 
 
 def run_train(args):
@@ -144,9 +195,7 @@ def run_train(args):
         note = "; in brackets: without motion" if entry["epoch"] == 1 else ""
         print(f"epoch {entry['epoch']}, step {entry['step']}: {terms}{note}", flush=True)
 
-    noise = run.meta.get("depth_noise")
-    objective = partial(under_noise, standard_deviation=noise) if noise else training.unsupervised
-    log = train_saving(interactions, run, out, objective, args.jobs, on_step, on_epoch)
+    log = train_saving(interactions, run, out, objective_of(run), args.jobs, on_step, on_epoch)
     log = [{**entry, "total": total(entry, run.recipe, entry["step"] - 1)} for entry in log]
     still = summed(run.meta["no_motion"])
     figures.save_figure(figures.training_figure(log, still), out.with_suffix(".png"))
@@ -164,7 +213,8 @@ def run_evaluate(args):
     folder_alone(args)
     run, interactions = checkpoints.load_run(args.checkpoint), load_interactions(args.data)
     truth = find_truth(args.data)
-    metrics = evaluation.evaluate(run, interactions, truth, progress_line("evaluate"))
+    faults = {name: value for name, value in vars(args).items() if value and f"--{name.replace('_', '-')}" in FAULTS}
+    metrics = evaluation.evaluate(run, interactions, truth, progress_line("evaluate"), **faults)
     print_label_free(metrics) if truth is None else print_metrics(metrics)
     write_json(args.json, metrics)
 
@@ -202,20 +252,22 @@ def run_explore(args):
 def run_reproduce(args):
     from . import figures
     out = Path(args.out or (f"runs/{args.table}" if args.table in ("planning", "contact")
-                            else "runs/reproduce-quick" if args.quick else "runs/reproduce"))
-    if args.table == "contact":
-        found = contact.reproduce(checkpoints.load_run(args.checkpoint), 100 if args.quick else 1000, args.jobs,
-                                  progress_line("poke"))
-        print(contact.contact_table(found))
-    elif args.table == "planning":
-        found, curves = tables.reproduce_planning(out, args.checkpoint, scenes=4 if args.quick else 20, jobs=args.jobs)
-        print(tables.planning_table(found))
-        figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
-    else:
-        names = list(tables.TABLES) if args.table == "all" else [args.table]
-        scale = tables.QUICK if args.quick else tables.FULL
-        found = tables.reproduce(names, out, scale, args.jobs, progress=progress_line("collect"))
-        print(tables.tables_text(names, found))
+                            else "runs/reproduce-quick" if args.quick else "runs/reproduce")).absolute()
+    checkpoint = Path(args.checkpoint).absolute()  # other machines have another working folder
+    with parallel_map(args.jobs, args.cluster) as map:
+        if args.table == "contact":
+            found = contact.reproduce(checkpoints.load_run(checkpoint), 100 if args.quick else 1000, map,
+                                      progress_line("poke"))
+            print(contact.contact_table(found))
+        elif args.table == "planning":
+            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map)
+            print(tables.planning_table(found))
+            figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
+        else:
+            names = list(tables.TABLES) if args.table == "all" else [args.table]
+            scale = tables.QUICK if args.quick else tables.FULL
+            found = tables.reproduce(names, out, scale, map, progress_line("collect"))
+            print(tables.tables_text(names, found))
     write_json(args.json or out / f"{args.table}.json", found)
 
 
@@ -230,7 +282,8 @@ def run_plan(args):
     if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search, path = planning.Search(**options), Path(args.out) / "plan.gif"
-    with control.random_task(args.seed, args.objects, args.obstacle, control.settings_for(run)) as task:
+    settings = replace(control.settings_for(run), **drawn_from(args)) if args.urdf else control.settings_for(run)
+    with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
         record = control.photographed(control.closed_loop(task, run, args.policy, search, args.budget, args.seed), task)
@@ -240,8 +293,10 @@ def run_plan(args):
         print(f"  poke {t + 1} to ({poke[0]:6.3f}, {poke[1]:6.3f}) m, direction {np.degrees(poke[2]):4.0f} deg: "
               f"{100 * distance[t]:5.1f} -> {100 * distance[t + 1]:5.1f} cm from the goals{done}")
     figures.save_sequence(path, record, task.arena.camera)
+    print(f"  stopped: {record['stopped']}")
     print(f"{path}: {len(distance) - 1} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
-    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0])})
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0]),
+                           "plan_stopped": record["stopped"]})
 
 
 # --- the demo ----------------------------------------------------------------------------------------------
@@ -265,9 +320,12 @@ def run_demo(args):
 
     jobs = "--jobs", args.jobs
     if simulating:
+        scenes = ("--objects", Settings.objects_min, MIDDLE["objects_max"], "--within", MIDDLE["place_within"],
+                  "--kinds", *MIDDLE["kinds"])
         run("Simulate pokes: before, after, and the poke alone.",
-            "collect", train, "--pokes", DEMO_POKES, "--seed", args.seed, *jobs)
-        run("Some more, to test with.", "collect", test, "--pokes", DEMO_TEST_POKES, "--seed", args.seed + 1, *jobs)
+            "collect", train, "--pokes", DEMO_POKES, "--seed", args.seed, *scenes, *jobs)
+        run("Some more, to test with.",
+            "collect", test, "--pokes", DEMO_TEST_POKES, "--seed", args.seed + 1, *scenes, *jobs)
     else:
         print(NO_BULLET)
     for ending in (".npz", ".csv", ".png"):
@@ -308,6 +366,20 @@ def term_weight(text):
     return name, float(value)
 
 
+def missing_kind(text):
+    """'0.3' -> 0.3, a share; a name stays one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def part_of(text):
+    """'3/8' -> (3, 8). Raises ValueError for anything else; argparse then says so."""
+    which, parts = map(int, text.split("/"))
+    return which, parts
+
+
 class OneLineParser(argparse.ArgumentParser):
     """argparse without the usage text before an error."""
 
@@ -315,17 +387,35 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz"}
+def checkpoint_path(text):
+    """A file's path, or 'camera' -> that of the shipped checkpoint for real cameras."""
+    return data_small() / "camera_checkpoint.npz" if text == "camera" else Path(text)
+
+
+SHIPPED = {"nargs": "?", "default": data_small() / "checkpoint.npz", "type": checkpoint_path,
+           "help": "a file, or camera: the shipped one for real cameras"}
 TEST = {"nargs": "?", "default": data_small() / "test"}
 SEED, PIXEL = {"type": int, "default": 0}, {"type": float, "nargs": 2, "action": "append", "metavar": ("X", "Y")}
 JOBS = {"type": int, "default": os.cpu_count(), "help": "processes; the result is the same"}
+CLUSTER = {"metavar": "ADDRESS", "help": "of a Dask scheduler, whose workers do it instead"}
 JSON = {"metavar": "FILE", "help": "write the figures here too"}
+OWN = {"--urdf": {"nargs": "+", "metavar": "FILE", "help": "objects of your own: anything rigid that Bullet loads"},
+       "--scale": {"type": float, "default": 1.0, "help": "how many times as large as the URDF files say"}}
 
 
 def fields(record, *names, **how):
     """Options for some fields of a record of settings, which has their defaults."""
     return {"--" + name.replace("_", "-"): {"type": type(value), "default": value, "help": f"default {value}", **how}
             for name, value in vars(record).items() if name in names}
+
+
+FAULTS = {  # of the camera that `evaluate` shows the pokes with
+    "--depth-noise": {"type": float, "metavar": "SD", "help": "of the depth, in m"},
+    "--missing": {"type": missing_kind, "action": "append", "metavar": f"SHARE|{'|'.join(ONE_SIDED)}",
+                  "help": "depth that is missing: a share at random, rims, shadows; again for another"},
+    "--pitch-error": {"type": float, "metavar": "DEG", "help": "how wrong the camera's pitch is"},
+    "--pose-error": {"type": float, "nargs": 2, "metavar": ("DEG", "M"),
+                     "help": "how wrong its pose is: turned about any axis, shifted in any direction"}}
 
 
 COMMANDS = {  # name: what runs it, what it does, its arguments as argparse takes them
@@ -338,9 +428,20 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                      "help": "part of the arena that they are put down in, at most 1"},
         "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
                    "help": "of the pictures, px, 4:3"},
-        "--kinds": {"nargs": "+", "default": Settings.kinds, "help": f"of {', '.join(KINDS)}"},
+        "--kinds": {"nargs": "+", "help": f"of {', '.join(KINDS)}; with --urdf too, half of the objects (default "
+                    f"{' '.join(Settings.kinds)}, with --urdf none)"},
+        **OWN,
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
-        "--jobs": JOBS, "--json": JSON}),
+        "--part": {"type": part_of, "metavar": "I/N", "default": (1, 1),
+                   "help": "the I-th of N that share the work, at once or not; without it, what is missing (default all)"},
+        "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
+    "import": (run_import, "make a folder of shards from a real camera's recording: see docs/own-data.md", {
+        "folder": {"help": "of the recording: camera.json, pokes.csv and PNG pictures"},
+        "out": {"help": "folder to write the shards to"},
+        "--size": {"type": int, "nargs": 2, "metavar": ("W", "H"), "default": (Settings.width, Settings.height),
+                   "help": "of the pictures to make, px"}, "--json": JSON}),
+    "export": (run_export, "write a folder of shards as a recording, at its size", {
+        "data": {"help": "folder of shards"}, "folder": {"help": "a new one, for the recording"}}),
     "train": (run_train, "train the full model (Eq. 6) on a folder of shards, without labels", {
         "data": {"nargs": "?", "default": data_small() / "train"},
         "out": {"help": "checkpoint to write (.npz); its log goes beside it (.csv and .png)"},
@@ -349,10 +450,14 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--weight": {"type": term_weight, "action": "append", "metavar": "TERM=VALUE",
                      "help": f"a weight of Eq. 6, 0 leaves the term out; terms: {', '.join(training.WEIGHTS)}"},
         "--depth-noise": {"type": float, "help": "SD in m of the noise to train under (0)"},
+        "--camera-faults": {"action": "store_true", "default": None, "help": "train for real cameras: under noise, "
+                            "missing depth and an uncertain pose"},
+        "--start-from": {"type": checkpoint_path, "metavar": "FILE",
+                         "help": "a checkpoint to begin with its parameters, not with random ones"},
         "--resume": {"action": "store_true", "help": "go on with the checkpoint OUT and its recipe"},
         "--jobs": JOBS, "--json": JSON}),
     "evaluate": (run_evaluate, "metrics of a checkpoint on a folder of shards; without arguments, the shipped ones", {
-        "checkpoint": SHIPPED, "data": TEST, "--json": JSON}),
+        "checkpoint": SHIPPED, "data": TEST, **FAULTS, "--json": JSON}),
     "show": (run_show, "one interaction as a picture; without arguments, a shipped one", {
         "checkpoint": SHIPPED, "data": TEST, "--out": {"default": "interaction.png"},
         "--row": {"type": int, "help": "which interaction (one that moves something well)"}}),
@@ -371,6 +476,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--seed": {**SEED, "help": f"which scene ({tables.TRAIN_SEED} has objects that were trained on)"},
         "--objects": {"type": int, "default": 1, "choices": (1, 2, 3), "help": "how many are to be moved"},
         "--obstacle": {"action": "store_true", "help": "a scene with another object in the way"},
+        **OWN,
         "--mark": {**PIXEL, "help": "a pixel on an object, again for each; --goal as often, in place of the scene's"},
         "--goal": {**PIXEL, "help": "where that shall go"},
         "--policy": {"choices": control.POLICIES, "default": "learned"},
@@ -385,7 +491,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
-        "--jobs": JOBS, "--json": JSON}),
+        "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
     "demo": (run_demo, "collect, train, evaluate, show and plan, in under five minutes; without pybullet, train, "
              "evaluate and show on the shipped pokes", {
         "--out": {"default": "runs/demo"}, "--seed": SEED, "--jobs": JOBS, "--json": JSON}),
@@ -405,7 +511,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "--seed": {"metavar": "FILE", "help": "of the held-back inputs: a number, or a file they never see (drawn)"},
         "--pokes": {"metavar": "FOLDER", "help": "assignment 8: held-back pokes, with their truth (the shipped ones)"},
         "--out": {"default": "results.json", "help": "in Gradescope's format, whole after every task"},
-        "--jobs": {"type": int, "default": 2, "help": "submissions at a time"}}),
+        "--jobs": {"type": int, "default": 2, "help": "submissions at a time"}, "--cluster": CLUSTER}),
 }
 
 

@@ -9,17 +9,15 @@ from functools import partial
 import numpy as np
 
 from .. import check_whole
-from ..sim.arena import Arena, Settings
+from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.collection import SHARD_POKES, collect_shard
 from .control import settings_for
 from .evaluation import errors_of_poke, ratio_of, scenes_of_pokes, true_motion
-from .processes import parallel_map
-from .tables import table
+from .tables import CROWDED, table
 
 ASIDE = 0.002  # m, to the left of the poke; `Arena.descent_is_free` leaves so much room
 WALLS = {1, 2, 3, 4}  # Bullet's numbers of them, as `Arena._build` makes them
 SEED = 900001
-CROWDED = Settings(objects_min=6, objects_max=7, place_within=0.95)
 
 # name -> (what the table says, which of the pokes that moved something belong to it; None: those of CROWDED)
 GROUPS = {
@@ -88,19 +86,18 @@ def watched_pokes(run, settings, seed, job):
     return found
 
 
-def reproduce(run, pokes, jobs=1, progress=None):
-    """The table from so many fresh pokes, and as many of CROWDED -> `summarise`'s figures. progress(done, total) is
-    called after every shard. Raises ValueError for numbers that cannot be.
+def reproduce(run, pokes, map=map, progress=None):
+    """The table from so many fresh pokes, and as many of CROWDED -> `summarise`'s figures. map: as of `collect`.
+    progress(done, total) is called after every shard. Raises ValueError for numbers that cannot be.
     """
     check_whole("pokes", pokes, 1)
     todo = [(first // SHARD_POKES, min(SHARD_POKES, pokes - first)) for first in range(0, pokes, SHARD_POKES)]
     found = [], []
-    with parallel_map(jobs) as map:
-        for each, settings in zip(found, (Settings(), CROWDED)):
-            for shard in map(partial(watched_pokes, run, settings_for(run, settings), SEED), todo):
-                each += shard
-                if progress:
-                    progress(sum(len(each) for each in found), 2 * pokes)
+    for each, settings in zip(found, (Settings(**MIDDLE), CROWDED)):
+        for shard in map(partial(watched_pokes, run, settings_for(run, settings), SEED), todo):
+            each += shard
+            if progress:
+                progress(sum(len(each) for each in found), 2 * pokes)
     return summarise(*found)
 
 

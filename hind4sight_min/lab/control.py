@@ -6,29 +6,33 @@ down, Bullet is asked whether its way is free (`carry_out`). The first start of 
 is nowhere free, the poke is spent.
 """
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from .. import check_whole
-from ..geometry import project, unproject
+from ..geometry import Camera, project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
-from ..planning import (NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts, roll,
-                        view_of)
+from ..planning import (SLACK, NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts,
+                        roll, view_of)
 from ..scene import scene_of
-from ..sim.arena import Arena, Settings
+from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
-from ..training import check_camera
+from .cameras import check_camera
 from .marks import follow, places_at, points_at
 
-SETTINGS = Settings(place_within=0.56)  # so that the finger gets behind every object
+SETTINGS = Settings(**{**MIDDLE, "place_within": 0.56})  # so that the finger gets behind every object
 IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
-REACHED = 0.4  # cost below which the goal counts as reached: less than followed marks and pixels can tell
-GAIN = 0.05  # of the cost; a poke that is predicted to bring less is not worth its risk
+NEAR = 2.0  # cost below which places are right and turns are left, about
+GAIN = 0.01  # of the cost; a poke that is predicted to bring less is not worth its risk
+CLEAR = 0.015  # m; what passes nearer by something else than this pushes it
+PASSES = 0.05  # share of the points that move; what is predicted to pass through something else may be so large
+STAYS = 0.005  # m; a mark that shall stay may be predicted to move so far
 TURN = np.pi / 4  # rad; goals are turned by at most this
 POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
@@ -36,8 +40,9 @@ POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 # --- tasks --------------------------------------------------------------------------------------------------------
 
 def settings_for(run, settings=SETTINGS):
-    """Settings, those of the test scenes, in pictures of the size that a run was trained with."""
-    return replace(settings, width=run.meta["camera"]["width"], height=run.meta["camera"]["height"])
+    """Settings, those of the test scenes, in pictures of the size that a run was trained with if they are 4:3."""
+    width, height = run.meta["camera"]["width"], run.meta["camera"]["height"]
+    return replace(settings, width=width, height=height) if 3 * width == 4 * height else settings
 
 
 @dataclass
@@ -59,7 +64,12 @@ class Task:
     @property
     def settings(self):
         """The arena's Settings as a dict."""
-        return asdict(self.arena.settings)
+        return vars(self.arena.settings)
+
+    @property
+    def stays(self):
+        """(M,) bool: marked points that shall be where they are."""
+        return np.linalg.norm(self.goal_marks - self.marks, axis=1) * self.arena.camera.pixel_size < SLACK
 
 
 @contextmanager
@@ -181,6 +191,38 @@ def oracle_rollout(arena, view, labels, settings):
     return rollout
 
 
+def careful(rollout, view, stays):
+    """A rollout without the plans that would push more than they say: their starts are NaN. Not in the paper.
+
+    The model sees what the finger meets, less well what that meets in turn. So hardly anything may be predicted to
+    `pass_through` something else, and no mark that stays, (M,) bool, to move by more than STAYS.
+    """
+    def checked(sequences):
+        clouds, starts = rollout(sequences)
+        before = np.concatenate([np.repeat(view.cloud[None, None], len(clouds), axis=0), clouds[:, :-1]], axis=1)
+        marks = np.flatnonzero(stays) + len(view.cloud) - view.marked
+        refused = (np.linalg.norm((clouds - before)[:, :, marks], axis=3) > STAYS).any(axis=2)
+        for which in np.argwhere(~refused):
+            here, there = (each[tuple(which)][view.occupied, :2] for each in (before, clouds))
+            refused[tuple(which)] = pass_through(here, there) > PASSES
+        return clouds, np.where(refused[..., None], np.nan, starts)
+    return checked
+
+
+def pass_through(before, after):
+    """Of the points that move: the share that on its way meets a point that goes less than half as far -> a number.
+
+    before, after (n, 2) m, on the plane of the arena.
+    """
+    length = np.linalg.norm(after - before, axis=1)
+    moves = length > CLEAR
+    if not moves.any():
+        return 0.0
+    way = [before[moves] + part * (after - before)[moves] for part in (1 / 3, 2 / 3, 1)]
+    distance, nearest = cKDTree(before).query(np.stack(way))
+    return np.mean((distance < CLEAR) & (length[nearest] < length[moves] / 2))
+
+
 def greedy_poke(view, goal, camera, settings, rng):
     """Push the mark that is farthest from its goal straight at it -> a sequence of one poke (1, 3)."""
     marks = view.marks.astype(float)
@@ -196,6 +238,11 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
+def two_ahead(search):
+    """A planning.Search for two pokes in a row, twice the candidates: of two objects that swap one must make room."""
+    return replace(search, horizon=2, candidates=min(2 * search.candidates, 10_000))
+
+
 def next_plan(policy, task, view, labels, goal, run, search, rng):
     """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle."""
     arena, settings = task.arena, task.settings
@@ -208,6 +255,11 @@ def next_plan(policy, task, view, labels, goal, run, search, rng):
     else:
         step = learned_step(run, view) if policy == "learned" else lambda clouds, pokes: clouds
         rollout = partial(roll, step, view, settings=settings)
+    if policy == "learned":
+        try:
+            return plan(careful(rollout, view, task.stays), view, goal, arena.camera, settings, search, rng)
+        except NoPoke:
+            pass  # then without care
     return plan(rollout, view, goal, arena.camera, settings, search, rng)
 
 
@@ -243,34 +295,41 @@ def distances(poses, task):
     here, there = poses[task.movers], task.goal_poses[task.movers]
     turn = (Rotation.from_quat(here[:, 3:]) * Rotation.from_quat(there[:, 3:]).inv()).as_matrix()
     angle = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
-    angle[[task.arena.kinds[i] == "can" for i in task.movers]] = np.nan
+    angle[[task.arena.round[i] for i in task.movers]] = np.nan
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 
 def closed_loop(task, run, policy, search, budget=10, seed=0):
-    """Observe, plan, poke, until the goal is reached, no poke is predicted to help, or the budget is spent -> a dict.
+    """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy.
-    Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as followed, distance (T+1, M) m, angle
-    (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no room; and of the task movers, goal_marks,
-    goal_rgb. Raises ValueError for a checkpoint of another camera, and NoPoke where not even the
-    first poke is possible; later on that ends the loop, as an empty arena does.
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. Where one
+    poke ahead sees no gain far from the goal, it looks two ahead before it stops.
+    stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
+    followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
+    room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
+    arena, and NoPoke where not even the first poke is possible; later on that ends the loop, as an empty arena does.
     """
     if policy not in POLICIES:
         raise ValueError(f"policy: expected one of {', '.join(POLICIES)}, got {policy!r}")
     check_whole("budget", budget, 1, 1000)
     arena, rng = task.arena, np.random.default_rng(seed)
-    check_camera(run, arena.camera)
+    check_camera(arena.camera, Camera(**run.meta["camera"]))
     (rgb, depth, labels), view, goal = first_look(task)
     states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
+    stopped = f"the budget of pokes, {budget}, is spent"
     while len(pokes) < budget:
         try:
             found = next_plan(policy, task, view, labels, goal, run, search, rng)
-        except NoPoke:
+            if found.cost > found.now - GAIN and found.now > NEAR and search.horizon == 1:
+                found = next_plan(policy, task, view, labels, goal, run, two_ahead(search), rng)
+        except NoPoke as none:
             if not pokes:
                 raise
+            stopped = str(none)
             break
-        if found.now < REACHED or found.cost > found.now - GAIN:
+        if found.cost > found.now - GAIN:
+            ahead = "no poke" if len(found.pokes) == 1 else f"no {len(found.pokes)} pokes in a row"
+            stopped = f"{ahead} would help, the model says; what is left costs {found.now:.2f}"
             break
         pokes.append(found.pokes[0])
         starts.append(carry_out(arena, view, pokes[-1], task.settings))
@@ -279,12 +338,14 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
         if np.isfinite(starts[-1]).all():
             marks = follow(view, predict(run.params, run.recipe.sizes, view.scene, pokes[-1][None]), scene)
         states.append((rgb, arena.poses(), marks, *distances(arena.poses(), task)))
-        if not scene.occupied.any():  # the last object left the arena
+        if not scene.occupied.any():
+            stopped = "the last object has left the arena"
             break
         view = view_of(scene, marks)
     record = dict(zip(("rgb", "poses", "marks", "distance", "angle"), map(np.stack, zip(*states))))
-    return {**record, "pokes": np.float32(pokes).reshape(-1, 3), "starts": np.float32(starts).reshape(-1, 2),
-            "movers": task.movers, "goal_marks": task.goal_marks, **({"goal_rgb": task.goal[0]} if task.goal else {})}
+    return {**record, "stopped": stopped, "pokes": np.float32(pokes).reshape(-1, 3),
+            "starts": np.float32(starts).reshape(-1, 2), "movers": task.movers, "goal_marks": task.goal_marks,
+            **({"goal_rgb": task.goal[0]} if task.goal else {})}
 
 
 def photographed(record, task, width=384):

@@ -5,15 +5,17 @@ This file reads the simulator's truth, where there is one; training does not.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from .. import losses
-from ..geometry import optical_flow, unproject
+from ..geometry import Camera, optical_flow, unproject
 from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
 from ..scene import Scene, most_changed
 from ..sim.truth import true_scene_flow
-from ..training import check_camera, scenes_of
-from .noise import with_depth_noise
+from ..training import scenes_of
+from .camera_faults import prepared, with_faults
+from .cameras import check_camera
 
 MOVING = 1e-3  # m; a point moves when its true motion is longer. Bullet's objects at rest stay below it.
 AT_WALL = 0.012  # m; a poke ends at a wall where a point that it moved ends so near to one, about a pixel
@@ -33,14 +35,15 @@ class Answer:
     heatmaps: tuple
 
 
-def ask(run, interactions, row, depth_noise=0.0):
-    """The whole model on one row of a data set -> Answer. depth_noise: SD in m of the noise it sees the depth with, the
-    same at every call, another for every row. Raises ValueError for another camera than the run was trained with.
+def ask(run, interactions, row, **faults):
+    """The whole model on one row of a data set -> Answer. faults: of the camera that it sees the row with, as those of
+    `camera_faults.with_faults`: the same at every call, others for every row. Pictures with faults, and all that a run
+    for real cameras is asked about, are `prepared` first. Raises ValueError for a camera that cannot show the run its arena.
     """
-    check_camera(run, interactions.camera)
+    check_camera(interactions.camera, Camera(**run.meta["camera"]))
     one = interactions[[row]]
-    if depth_noise:
-        one = with_depth_noise(one, depth_noise, np.random.default_rng([0, row]))
+    if any(faults.values()) or run.meta.get("camera_faults"):
+        one = prepared(with_faults(one, np.random.default_rng([0, row]), **faults))
     before, after = scenes_of(one)
     prediction = predict(run.params, run.recipe.sizes, before, one.pokes)
     flow = optical_flow(before.points, prediction.points, one.camera).reshape(before.images.shape[1:3] + (2,))
@@ -71,14 +74,27 @@ def poke_from_heatmaps(start_heatmap, end_heatmap, settings):
 def true_motion(interactions, truth, row):
     """What really happened in one interaction, from its depth without noise.
 
-    -> true scene flow (N, 3) m, true optical flow (N, 2) px, and which points have depth and move, (N,) bool.
+    -> true scene flow (N, 3) m, true optical flow (N, 2) px, and which points move, (N,) bool. A point without depth
+    moves too, as if it were where the nearest one of its object is: left out, it would flatter a model that sees holes.
     """
-    depth = interactions.depth_before[row]
+    depth = depth_of_objects(interactions.depth_before[row], truth.labels[row])
     points = unproject(depth, interactions.camera)
     flow = true_scene_flow(points, truth.labels[row], truth.poses_before[row], truth.poses_after[row])
     pixels = optical_flow(points, points + flow, interactions.camera)
     moving = (depth > 0) & (np.linalg.norm(flow, axis=2) > MOVING)
     return flow.reshape(-1, 3), pixels.reshape(-1, 2), moving.ravel()
+
+
+def depth_of_objects(depth, labels):
+    """Depth (H, W) m with the holes of each object filled with its depth nearest by in the picture; labels (H, W)."""
+    filled = depth.copy()
+    for label in np.unique(labels[labels > 0]):
+        here = labels == label
+        known = here & (depth > 0)
+        if known.any():
+            nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+            filled[here] = depth[tuple(nearest)][here]
+    return filled
 
 
 def matched_iou(masks, labels, moved):
@@ -104,20 +120,22 @@ def poke_errors(poke, true_poke):
             np.abs((turn + np.pi) % (2 * np.pi) - np.pi))
 
 
-def errors_of_poke(run, interactions, truth, row, depth_noise=0.0):
-    """All errors of one poke -> dict: sums over its moving, its still and all its points (m, px, m^2), and counts;
+def errors_of_poke(run, interactions, truth, row, **faults):
+    """All errors of one poke -> dict: sums over its moving, its still and all its points (m, px, m^2), and counts; a
+    moving point that the model sees no depth of, and does not fill in, is one that it says does not move;
     iou: of each object that moved; poke: as the inverse model names it; at_wall: whether something ended at a wall.
     """
-    answer = ask(run, interactions, row, depth_noise)
-    points, seen = answer.before.points[0], answer.before.valid[0]
+    answer = ask(run, interactions, row, **faults)
+    points = answer.before.points[0]
     true, true_pixels, moving = true_motion(interactions, truth, row)
-    labels = truth.labels[row].ravel()
+    seen, labels = answer.before.valid[0] | moving, truth.labels[row].ravel()
     moved = [label for label in np.unique(labels[moving]) if label > 0]
     error = np.linalg.norm(answer.prediction.points[0] - points - true, axis=1)
     pixel_error = np.linalg.norm(answer.flow.reshape(-1, 2) - true_pixels, axis=1)
     length, pixel_length = np.linalg.norm(true, axis=1), np.linalg.norm(true_pixels, axis=1)
-    clean = unproject(interactions.depth_before[row], interactions.camera).reshape(-1, 3)
-    ends = np.abs((clean + true)[moving, :2])
+    depth = interactions.depth_before[row]
+    ends = unproject(depth, interactions.camera).reshape(-1, 3) + true
+    ends = np.abs(ends[moving & (depth.ravel() > 0), :2])
     return {"moving": moving.sum(), "still": (seen & ~moving).sum(), "error": error[moving].sum(),
             "length": length[moving].sum(), "drift": error[seen & ~moving].sum(),
             "squared_error": (error[moving] ** 2).sum(), "squared_motion": (length[moving] ** 2).sum(),
@@ -130,15 +148,15 @@ def errors_of_poke(run, interactions, truth, row, depth_noise=0.0):
 
 # --- the summary --------------------------------------------------------------------------------------------------
 
-def evaluate(run, interactions, truth=None, progress=None, depth_noise=0.0):
+def evaluate(run, interactions, truth=None, progress=None, **faults):
     """All metrics on a data set -> flat dict of floats; see `summary`, and without a truth `label_free_errors`, whose
-    means over the pokes these then are. depth_noise: SD in m of noise on the depth that the model sees.
+    means over the pokes these then are. faults: of the camera that the model sees the pokes with, see `ask`.
     progress(done, total) is called after every poke.
     """
     pokes = []
     for row in range(len(interactions)):
-        pokes.append(label_free_errors(run, interactions, row, depth_noise) if truth is None else
-                     errors_of_poke(run, interactions, truth, row, depth_noise))
+        pokes.append(label_free_errors(run, interactions, row, **faults) if truth is None else
+                     errors_of_poke(run, interactions, truth, row, **faults))
         if progress:
             progress(row + 1, len(interactions))
     if truth is None:
@@ -147,13 +165,13 @@ def evaluate(run, interactions, truth=None, progress=None, depth_noise=0.0):
     return summary(pokes, interactions.pokes, scenes_of_pokes(truth))
 
 
-def label_free_errors(run, interactions, row, depth_noise=0.0):
+def label_free_errors(run, interactions, row, **faults):
     """What can be said of one poke whose truth nobody knows: how well the prediction explains the next picture.
 
     Paper: Eq. (2) and (3), sums over the pixels that count, in cm^2 and in intensity, and no_motion_* the same where
     nothing moves. They fall with better predictions, but noise and what the poke uncovers keep them above 0.
     """
-    answer = ask(run, interactions, row, depth_noise)
+    answer = ask(run, interactions, row, **faults)
     before, after = answer.before, answer.after
     valid, next_valid = losses.seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     found = {}

@@ -16,14 +16,14 @@ from ..course.carve import take_written
 from ..course.task import described
 from ..disk.checkpoints import load_run
 from ..disk.files import check_output
-from ..geometry import optical_flow, project, rigid
+from ..geometry import Camera, optical_flow, project, rigid
 from ..interactions import occupied_grid
 from ..losses import chamfer_loss, distance_maps, seen_in_both
 from ..networks import predict
 from ..planning import Search, first_start, goal_of, learned_step, plan, possible_starts, roll, view_of
 from ..scene import scene_of
-from ..training import check_camera
 from . import figures
+from .cameras import check_camera
 from .cli import data_small
 from .evaluation import MOVING
 from .marks import at_height, follow, places_at, points_at
@@ -46,7 +46,7 @@ class Explorer:
     """
 
     def __init__(self, figure, world, run, out=".", yours=()):
-        check_camera(run, world.camera)
+        check_camera(world.camera, Camera(**run.meta["camera"]))
         self.figure, self.canvas, self.world, self.run = figure, figure.canvas, world, run
         self.camera, self.settings, self.out, self.yours = world.camera, world.settings, Path(out), yours
         self.art = figures.explorer_panels(figure, self.camera, self.settings, KEYS)

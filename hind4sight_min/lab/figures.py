@@ -203,7 +203,7 @@ def _draw_losses(panels, answer):
     valid, next_valid = seen_in_both(before.valid, after.valid, before.occupied, after.occupied)
     warped, in_view = warp_backward(after.images, answer.flow[None])
     show_image(panels["warped"], np.clip(warped[0], 0, 1),
-               "$\\hat I_t$: after, warped back along\nthe flow, should be before, Sec. III-C")
+               "$\\hat I_t$: $I_{t+1}$ warped back along the flow;\nideally $I_t$, Sec. III-C")
     error = np.abs(image - warped[0]).sum(axis=-1)  # Eq. (3) before the sum over pixels
     error = np.ma.array(error, mask=~(valid.reshape(error.shape) & in_view[0]))
     shown = show_image(panels["error"], error, "Photometric error $|I_t - \\hat I_t|$ (Eq. 3)\ngrey: not counted",
@@ -242,21 +242,24 @@ def _draw_pictures(panels, images, photographs, arrow):
     place = {"extent": (-0.5, width - 0.5, height - 0.5, -0.5)}  # a photograph's axes too are the model's pixels
     whole = images if photographs is None else photographs
     for name, symbol, image, photograph in zip(("before", "after"), ("I_t", "I_{t+1}"), images, whole):
-        poke = " and the poke $u_t$" if name == "before" else ""
+        poke = ", and the poke $u_t$" if name == "before" else ""
         show_image(panels[f"photo_{name}"], photograph, f"{name.capitalize()}{poke}:\nwhat the camera sees", **place)
         show_image(panels[name], image, f"What the model gets: ${symbol}$,\n{width} x {height} pixels (framed part)")
     for name in ("photo_before", "before"):
         draw_arrow(panels[name], *arrow)
 
 
-def _zoom(panels, target, size):
-    """Show half of the picture, around the poke's target (2,) px, and frame that part in the whole ones."""
+def zoom(near, whole, target, size):
+    """Show half of the picture, around the poke's target (2,) px, and frame that part where the whole is shown.
+
+    Not in the paper. near, whole: Axes; size: (width, height) px of the model's picture.
+    """
     size = np.array(size)
     low = np.clip(target - size / 4, 0, size / 2) - 0.5
-    for name in set(NEAR_POKE) & set(panels):
-        panels[name].set(xlim=(low[0], low[0] + size[0] / 2), ylim=(low[1] + size[1] / 2, low[1]))
-    for name in WHOLE:
-        panels[name].add_patch(Rectangle(low, *(size / 2), fill=False, color="white", linewidth=1.5))
+    for axes in near:
+        axes.set(xlim=(low[0], low[0] + size[0] / 2), ylim=(low[1] + size[1] / 2, low[1]))
+    for axes in whole:
+        axes.add_patch(Rectangle(low, *(size / 2), fill=False, color="white", linewidth=1.5))
 
 
 def _draw_motion(panels, interactions, row, answer, truth):
@@ -280,7 +283,7 @@ def _draw_motion(panels, interactions, row, answer, truth):
     for name, title in (("flow", "Predicted optical flow\n(U, V), Sec. III-C"), ("true_flow", "True optical flow\n")):
         if name in flows:
             show_flow(panels[name], flows[name], scale, title)
-    draw_wheel(panels["flow"], scale, low=poke[1] > 0)  # away from the target
+    draw_wheel(panels["flow"], scale, low=poke[1] >= start[1])  # what moves upwards leaves room below
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      interactions.settings["arena"])
 
@@ -299,7 +302,8 @@ def interaction_figure(interactions, row, answer, truth=None, photographs=None):
     _draw_pictures(panels, (answer.before.images[0], answer.after.images[0]), photographs, arrow)
     _draw_motion(panels, interactions, row, answer, truth)
     _draw_losses(panels, answer)
-    _zoom(panels, arrow[1], (camera.width, camera.height))
+    zoom([panels[name] for name in NEAR_POKE if name in panels], [panels[name] for name in WHOLE], arrow[1],
+         (camera.width, camera.height))
     for which, symbol, heatmap, place in zip(("start", "end"), "AB", answer.heatmaps, (start, poke[:2])):
         _draw_heatmap(panels[which], heatmap.reshape(grid_shape(interactions.settings)), place,
                       interactions.settings["arena"], which, symbol)
@@ -420,12 +424,12 @@ def save_sequence(path, record, camera):
     if "goal_rgb" in record:
         beside.append(([record.get("goal_photograph", record["goal_rgb"])] * (last + 1), "the goal\n"))
     figure = Figure(figsize=(4.2 * (1 + len(beside)), 3.7), dpi=80)
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.88, bottom=0.02, wspace=0.04)
+    margins = {"left": 0.01, "right": 0.99, "top": 0.88, "bottom": 0.02, "wspace": 0.04}
     writer, place = PillowWriter(fps=1), {"extent": (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)}
     with whole_file(path) as temporary, writer.saving(figure, str(temporary), dpi=80):
         for t, picture in enumerate(pictures):
             figure.clear()
-            panels = figure.subplots(1, 1 + len(beside), squeeze=False)[0]
+            panels = figure.subplots(1, 1 + len(beside), squeeze=False, gridspec_kw=margins)[0]
             title = f"after {t} pokes: {distance[t]:.1f} cm to go"
             show_image(panels[0], picture, title if t == last else f"{title}\nnext: poke {t + 1}", **place)
             _draw_marks(panels[0], record, t, camera)
@@ -491,7 +495,7 @@ def control_figure(curves, pokes):
                  xticks=range(0, pokes + 1, 2))
         axes.grid(alpha=0.3, axis="y")
     figure.axes[0].set_ylabel("mean distance to the goals [cm]")
-    figure.axes[-1].legend(fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize=9)
     figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
     return figure
 

@@ -62,26 +62,40 @@ SMOOTHING = 0.027, 0.15, 0.02  # what counts as near: radius and SD in m on the 
 
 
 def smooth_depth(depth, empty_depth, images, camera):
-    """Take noise out of depth pictures with the help of the colours: a joint bilateral filter. Not in the paper.
+    """Take noise out of depth pictures and fill their holes with the help of the colours: a joint bilateral filter.
 
-    In the difference to the empty arena the table is flat at 0 and objects are islands some cm high. There each pixel
-    becomes a mean of those around it, weighted by how near they are: in the picture, in colour, and in a first guess of
-    the difference, a bilateral filter of it alone. Of 1 cm of noise that leaves 2 mm on the table and 7 on objects.
-    depth (B, H, W) m, 0 = missing, which stays and counts for nobody; empty_depth (H, W) m, complete;
-    images (B, H, W, 3) uint8 -> the shape and dtype of depth.
+    Not in the paper. In the difference to the empty arena the table is flat at 0 and objects are islands some cm high.
+    There each pixel becomes a mean of those around it, weighted by how near they are: in the picture, in colour, and in
+    a first guess of the difference, a bilateral filter of it alone, holes filled by picture and colour. Of 1 cm of
+    noise that leaves 2 mm on the table and 7 on objects.
+    depth (B, H, W) m, 0 = missing, which counts for nobody, and stays where nothing alike is near; empty_depth (H, W)
+    m, where 0 = missing depth stays as it is; images (B, H, W, 3) uint8 -> the shape and dtype of depth.
     """
     reach, colour, metres = SMOOTHING
     px = reach / camera.pixel_size
-    radius, (height, width) = max(1, round(px)), depth.shape[-2:]
-    seen = (depth > 0).astype(np.float32)
-    difference = seen * (depth - empty_depth).astype(np.float32)
-    guess = np.stack([cv2.bilateralFilter(each, 2 * round(px * 2 / 3) + 1, 0.025, px / 2) for each in difference])
-    red_green_blue = np.moveaxis(images, -1, 0) / np.float32(255 * colour)
+    seen = (depth > 0) & (empty_depth > 0)
+    difference = np.where(seen, depth - empty_depth, 0).astype(np.float32)
+    colours, filled = [*(np.moveaxis(images, -1, 0) / np.float32(255 * colour))], difference
+    if not seen.all():
+        filled = np.where(seen, difference, mean_of_near(difference, seen, colours, px)[0])
+    guess = np.stack([cv2.bilateralFilter(each, 2 * round(px * 2 / 3) + 1, 0.025, px / 2) for each in filled])
+    smooth, weight = mean_of_near(difference, seen, [guess / np.float32(metres), *colours], px)
+    known = (empty_depth > 0) & (weight > ALIKE)
+    return np.where(known, empty_depth + smooth, depth).astype(depth.dtype)
+
+
+ALIKE = 1e-3  # a hole is filled where the weights around it sum to more
+
+
+def mean_of_near(values, seen, guides, px):
+    """Of values (B, H, W), the mean of those that are `seen` up to px pixels away, weighted by exp(-d^2 / 2): d is how
+    far apart they are in the picture, in units of px, and in each of the guides (B, H, W). -> means, sums of weights.
+    """
+    radius, (height, width) = max(1, round(px)), values.shape[-2:]
     # With a rim, where nothing is seen, a shift is an offset in flat arrays: twice as fast.
     rim = (0, 0), (0, radius), (0, radius)
-    seen, difference, *guides = (np.pad(each, rim).ravel()
-                                 for each in (seen, difference, guess / np.float32(metres), *red_green_blue))
-    total, weight = difference.copy(), seen.copy()
+    seen, values, *guides = (np.pad(each, rim).ravel() for each in (seen.astype(np.float32), values * seen, *guides))
+    total, weight = values.copy(), seen.copy()
     for dv in range(radius + 1):
         for du in range(-radius if dv else 1, radius + 1):  # each pair of pixels once, for both
             offset = dv * (width + radius) + du
@@ -90,12 +104,12 @@ def smooth_depth(depth, empty_depth, images, camera):
             for guide in guides:
                 apart = apart + np.square(guide[here] - guide[there])
             near = np.exp(-apart / 2)
-            total[here] += near * difference[there]
-            total[there] += near * difference[here]
+            total[here] += near * values[there]
+            total[there] += near * values[here]
             weight[here] += near * seen[there]
             weight[there] += near * seen[here]
-    smooth = (total / np.maximum(weight, 1e-6)).reshape(-1, height + radius, width + radius)[:, :height, :width]
-    return np.where(depth > 0, empty_depth + smooth, 0).astype(depth.dtype)
+    mean = total / np.maximum(weight, 1e-6)
+    return [each.reshape(-1, height + radius, width + radius)[:, :height, :width] for each in (mean, weight)]
 
 
 def under_noise(params, recipe, interactions, rng, standard_deviation, objective=unsupervised):

@@ -1,4 +1,7 @@
-"""Several processes: for collection, for the chunks of a training step, and for the cells of a table."""
+"""Several processes: for collection, for the chunks of a training step, for the cells of a table.
+
+Whatever can be spread takes a `map`: Python's own, that of any `concurrent.futures.Executor`, or one of these.
+"""
 import os
 import signal
 from concurrent.futures import ProcessPoolExecutor
@@ -23,27 +26,44 @@ def _begin_worker():
     Thread(target=wait, daemon=True).start()
 
 
-def worker_pool(jobs):
-    """A pool of `jobs` processes.
+@contextmanager
+def cluster_map(address):
+    """A `map` over the workers of the Dask scheduler at an address; what a lost worker had is given to another one.
 
-    Fresh processes, not forks, which neither Bullet nor thread pools survive; so a script that asks for jobs > 1
-    needs the usual `if __name__ == "__main__":`.
+    The workers need this package, and the files under the same paths. Raises RuntimeError where Dask is missing or a
+    call has lost one worker after the other, OSError where no scheduler or no worker is there.
     """
-    return ProcessPoolExecutor(jobs, get_context("spawn"), _begin_worker)
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError:
+        raise RuntimeError("a cluster needs Dask: pip install 'hind4sight_min[cluster]'") from None
+    with Client(address) as client:
+        client.wait_for_workers(1, timeout=30)
+        try:
+            yield client.get_executor().map
+        except KilledWorker as error:
+            raise RuntimeError(f"cluster: {error}") from None
 
 
 @contextmanager
-def parallel_map(jobs):
+def parallel_map(jobs, cluster=None):
     """A `map` that spreads its calls over `jobs` processes, this one included; results come in order, one by one.
+    cluster: address of a scheduler, whose workers make the calls instead.
 
-    Not threads: autograd holds Python's global lock for so long that a second thread brings a fifth more at best.
-    Raises ValueError for a number of processes that cannot be.
+    Fresh processes, not forks, which neither Bullet nor thread pools survive; so a script that asks for jobs > 1
+    needs the usual `if __name__ == "__main__":`. Not threads: autograd holds Python's global lock for so long that a
+    second one brings a fifth more at best. Raises ValueError for a number of processes that cannot be, and as
+    `cluster_map`.
     """
     check_whole("jobs", jobs, 1, 1024)
+    if cluster:
+        with cluster_map(cluster) as map_there:
+            yield map_there
+        return
     if jobs == 1:
         yield map
         return
-    pool = worker_pool(jobs - 1)
+    pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"), _begin_worker)
 
     def parallel(function, *arguments):
         calls = list(zip(*arguments))

@@ -10,6 +10,7 @@ from ..disk.files import only_one, plain, write_text
 from ..disk.shards import check_same_data, stamp
 from ..networks import init_parameters
 from ..training import CHUNK, learning_rate, recipe_at, train, unsupervised
+from .cameras import check_camera
 from .processes import parallel_map
 
 SAMPLE = 64  # pokes: enough to say what a loss is without motion
@@ -60,7 +61,8 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     run.meta["seconds"]; so a run that was resumed has the log of one that was not. The log also goes beside `path`, as
     CSV. run.meta["data"] says of which data set the run is, run.meta["no_motion"] what the terms are without motion.
     jobs: processes, on which the result does not depend. on_step(run, terms), on_epoch(entry): called after each.
-    Raises ValueError for another data set than the run began with, and where another process writes to `path`;
+    Raises ValueError for another data set than the run began with, for a camera that does not show the arena, and where
+    another process writes to `path`;
     FloatingPointError where the loss is no number any more.
     """
     first, recipe, meta, per_epoch = run.step, run.recipe, run.meta, max(1, len(data) // run.recipe.batch)
@@ -68,6 +70,7 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     began = saved = time.perf_counter()
     data_stamp = plain(stamp(getattr(data, "interactions", data)))  # SE3-Nets has its own around them
     check_same_data(path, meta.get("data"), data_stamp)
+    check_camera(data.camera)
     meta["data"] = data_stamp
 
     def save():

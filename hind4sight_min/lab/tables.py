@@ -3,37 +3,35 @@
 Paper: Sec. IV, Tables I to III, and the control experiment of Sec. IV-G. Every cell of a table is a training run with a
 budget of its own, on one core; what is finished leaves its figures in a file and is never run again.
 """
-import json
 import subprocess
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from itertools import product
-from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
+from scipy.special import stdtrit
 
-from .. import check_whole, planning, training
+from .. import planning, training
 from ..disk import checkpoints
-from ..disk.files import plain, write_json
+from ..disk.files import plain, read_json, write_json
 from ..disk.shards import load_interactions
-from ..sim.arena import Settings
+from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
 from ..sim.objects import HELD_OUT
 from ..sim.truth import load_truth
 from . import control, evaluation, image_pairs, se3nets
 from .noise import under_noise
-from .processes import parallel_map, worker_pool
 from .runs import train_saving
 
 
 @dataclass(frozen=True)
 class Scale:
-    """train_pokes, test_pokes: how many. steps: of every cell of the tables; long_steps: of the headline models."""
-    train_pokes: int = 24000
+    """train_pokes, test_pokes: how many (of each of TESTS, times its factor). steps: of every cell of the tables; long_steps: of the headline models."""
+    train_pokes: int = 48000
     test_pokes: int = 1000
     steps: int = 3000
-    long_steps: int = 20000
+    long_steps: int = 30000
     seeds: tuple = (1, 2, 3)
 
 
@@ -61,6 +59,9 @@ MODELS = {
     "full": ("full model", training.WEIGHTS, None, (1.47, 1.63)),
 }
 NO_MOTION_PAPER = 12.6  # Table II, cm^2
+# What the ablation orders, the larger error first, and the SD that Table I gives of each, without and with noise.
+ORDER = (("2d_3d", "full"), ("2d", "2d_3d"), ("3d", "2d_3d"))
+SD_PAPER = {"2d": (0.46, 0.48), "3d": (0.49, 24.08), "2d_3d": (0.50, 0.64), "full": (0.49, 0.47)}
 OPTICAL_PAPER, PEER_PAPER = "0.05", "0.11"  # Table III, px; the peer is FlowNet 2.0
 
 TABLES = {"flow": [name for name in MODELS if name.startswith("se3nets")] + ["full"],
@@ -80,13 +81,18 @@ class Cell:
         """What the runs of all seeds have in common, as the figures' names say it."""
         return f"{self.model}_{self.noise}" + ("_long" if self.long else "")
 
+    @property
+    def name(self):
+        """As its file is called."""
+        return f"{self.group}-{self.seed}"
+
 
 def cells_of_tables(tables, scale):
     """The cells that some tables need, each once; the long runs of the full model are the headlines of all of them."""
     cells = []
     for seed in scale.seeds:  # so that one seed of everything is there first
         cells += [Cell("full", noise, seed, long=True) for noise in NOISES]
-        cells += [Cell(model, noise, seed) for table in tables for model in TABLES[table] for noise in NOISES]
+        cells += [Cell(model, noise, seed) for noise in NOISES for table in tables for model in TABLES[table]]
     return list(dict.fromkeys(cells))
 
 
@@ -109,17 +115,27 @@ def objective_of(cell):
 # Also of the shipped checkpoint's pokes. A task of this seed would share its random numbers with a training shard, and
 # so its objects: no scene of the control experiment has it.
 TRAIN_SEED = 5
+CROWDED = Settings(objects_min=6)
+
+# name -> (seed, settings, times how many pokes). All models meet the first one, the headlines' the others too: kinds
+# and textures never trained on beside known ones, pokes as the training ones, and 6 or 7 objects all over the arena.
+TESTS = {
+    "test": (101, Settings(**MIDDLE), 1),
+    "unseen": (102, Settings(**{**MIDDLE, **HELD_OUT}), 4),
+    "known": (103, Settings(**MIDDLE), 4),
+    "all_over": (104, Settings(), 1),
+    "crowded": (105, CROWDED, 1),
+}
 
 
 def collect_data(out, scale, map=map, progress=None):
-    """Training pokes, test pokes, and test pokes of objects and textures never trained on; completes what is there."""
-    for name, pokes, seed, settings in (("train", scale.train_pokes, TRAIN_SEED, Settings()),
-                                        ("test", scale.test_pokes, 101, Settings()),
-                                        ("unseen", scale.test_pokes, 102, Settings(**HELD_OUT))):
-        collect(out / name, pokes, seed, settings, map, progress)
+    """Training pokes and those of TESTS; completes what is there."""
+    collect(out / "train", scale.train_pokes, TRAIN_SEED, Settings(), map, progress)
+    for name, (seed, settings, times) in TESTS.items():
+        collect(out / name, times * scale.test_pokes, seed, settings, map, progress)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def _data(folder):
     return se3nets.Supervised(load_interactions(folder), load_truth(folder))
 
@@ -144,10 +160,25 @@ def once(path, made, compute):
     if not path.exists():
         began_at = commit()
         write_json(path, {**made, "metrics": compute(), "commit": began_at})
-    found = json.loads(path.read_text())
-    if any(found.get(name) != value for name, value in made.items()):
-        raise ValueError(f"{path}: made with another recipe, network or search; remove it, or choose another --out")
+    found = read_json(path)
+    if "metrics" not in found or not made_of(found, made):
+        raise ValueError(f"{path}: made with another recipe, network, data or search; remove it, or choose another "
+                         "--out")
     return found["metrics"]
+
+
+def made_of(found, made):
+    """Whether the figures of a file, as `once` wrote it, were made of this."""
+    return all(found.get(name) == value for name, value in made.items())
+
+
+def ingredients(cell, scale):
+    """All that decides the figures of a cell, in plain JSON types, as `once` keeps it."""
+    data = {"train": (TRAIN_SEED, Settings().plain, scale.train_pokes),
+            **{name: (seed, settings.plain, times * scale.test_pokes)
+               for name, (seed, settings, times) in TESTS.items()}}
+    return plain({"recipe": asdict(recipe_of(cell, scale)), "window": MODELS[cell.model][2],
+                  "depth_noise": NOISES[cell.noise], "format": checkpoints.FORMAT, "data": data})
 
 
 def run_cell(cell, out, scale, save_every=60.0):
@@ -155,7 +186,7 @@ def run_cell(cell, out, scale, save_every=60.0):
 
     `python docs/results.py keep` collects the files of what is finished.
     """
-    path, recipe, noise = out / "cells" / f"{cell.group}-{cell.seed}.npz", recipe_of(cell, scale), NOISES[cell.noise]
+    path, recipe, noise = out / "cells" / f"{cell.name}.npz", recipe_of(cell, scale), NOISES[cell.noise]
     window = MODELS[cell.model][2]
 
     def compute():
@@ -167,36 +198,23 @@ def run_cell(cell, out, scale, save_every=60.0):
         train_saving(data if window else data.interactions, run, path, objective_of(cell), save_every=save_every)
         metrics = evaluation.evaluate(run, **vars(_data(out / "test")), depth_noise=noise)
         if cell.long and not noise:
-            unseen = evaluation.evaluate(run, **vars(_data(out / "unseen")))
-            metrics.update({f"unseen_{name}": value for name, value in unseen.items()})
+            for test in list(TESTS)[1:]:
+                found = evaluation.evaluate(run, **vars(_data(out / test)))
+                metrics.update({f"{test}_{name}": value for name, value in found.items()})
         return {**metrics, "train_seconds": run.meta["seconds"]}
 
-    return once(path.with_suffix(".json"), {
-        "recipe": plain(asdict(recipe)), "window": window, "depth_noise": noise, "format": checkpoints.FORMAT,
-        "train_pokes": scale.train_pokes, "test_pokes": scale.test_pokes}, compute)
+    return once(path.with_suffix(".json"), ingredients(cell, scale), compute)
 
 
 # --- all of them ------------------------------------------------------------------------------------------------
 
-def run_all(function, tasks, jobs):
-    """(task, function(*task)) of tuples, in order, as they are there; over so many processes."""
-    check_whole("jobs", jobs, 1)
-    with worker_pool(jobs) as pool:
-        try:
-            yield from zip(tasks, pool.map(function, *zip(*tasks)))
-        except BaseException:  # an interrupt must not wait for what runs: its files are on disk
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
-
-
-def reproduce(tables, out, scale, jobs=1, progress=None):
-    """Everything that some tables need -> flat dict of figures. Cells run side by side, one core each."""
-    with parallel_map(jobs) as map:
-        collect_data(out, scale, map, progress)
+def reproduce(tables, out, scale, map=map, progress=None):
+    """Everything that some tables need -> flat dict of figures. map: as of `collect`; cells run side by side with that
+    of an executor, one core each.
+    """
+    collect_data(out, scale, map, progress)
     cells, results = cells_of_tables(tables, scale), {}
-    for (cell,), metrics in run_all(partial(run_cell, out=out, scale=scale), [(cell,) for cell in cells], jobs):
+    for cell, metrics in zip(cells, map(partial(run_cell, out=out, scale=scale), cells)):
         results[cell] = metrics
         print(f"{len(results)} of {len(cells)}: {cell.group}, seed {cell.seed}: ratio {metrics['flow_mse_ratio']:.3f}, "
               f"{metrics['train_seconds'] / 60:.1f} min", flush=True)
@@ -207,7 +225,11 @@ def reproduce(tables, out, scale, jobs=1, progress=None):
 
 
 def summarise(results, scale):
-    """{Cell: metrics} -> mean and SD over the seeds of every metric, and the scale: a flat dict."""
+    """{Cell: metrics} -> mean and SD over the seeds of every metric, and the scale: a flat dict.
+
+    worse_less_better_noise of ORDER: by how much the ratios of the same seed differ, the mean; _ci95: half of its 95 %
+    interval, by Student's t.
+    """
     figures, groups = asdict(scale), {}
     for cell, metrics in results.items():
         groups.setdefault(cell.group, []).append(metrics)
@@ -216,6 +238,12 @@ def summarise(results, scale):
             values = [metrics[metric] for metrics in seeds]
             figures[f"{group}_{metric}"] = float(np.mean(values))
             figures[f"{group}_{metric}_sd"] = float(np.std(values, ddof=1))
+    for (worse, better), noise in product(ORDER, NOISES):
+        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])] for model in (worse, better)]
+        if all(ours):
+            less, name = np.subtract(*ours), f"{worse}_less_{better}_{noise}"
+            figures[name] = float(less.mean())
+            figures[f"{name}_ci95"] = float(stdtrit(len(less) - 1, 0.975) * less.std(ddof=1) / np.sqrt(len(less)))
     return figures
 
 
@@ -246,6 +274,18 @@ def flow_table(figures, name):
     return table(*rows)
 
 
+def order_table(figures):
+    """How sure the order of the ablation is: differences within a seed, ours with their interval, and the paper's."""
+    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval over seeds")]
+    for (worse, better), (i, noise) in product(ORDER, enumerate(NOISES)):
+        name, paper = f"{worse}_less_{better}_{noise}", MODELS[worse][3][i] - MODELS[better][3][i]
+        if name in figures:
+            rows.append((f"{MODELS[worse][0]} less {MODELS[better][0]}", noise, f"{paper / NO_MOTION_PAPER:.3f}",
+                         ", ".join(f"{SD_PAPER[model][i] / NO_MOTION_PAPER:.3f}" for model in (worse, better)),
+                         f"{figures[name]:.3f} \u00b1 {figures[name + '_ci95']:.3f}"))
+    return table(*rows)
+
+
 def optical_table(figures):
     """Table III of the paper, ours beside it."""
     rows = [("optical flow, end-point error", "sees", "paper", "moving pixels, px", "all pixels, px")]
@@ -260,8 +300,8 @@ def optical_table(figures):
 
 def tables_text(tables, figures):
     """The asked-for tables as Markdown."""
-    return "\n\n".join(optical_table(figures) if name == "optical-flow" else flow_table(figures, name)
-                       for name in tables)
+    made = {"optical-flow": [optical_table], "ablation": [partial(flow_table, name="ablation"), order_table]}
+    return "\n\n".join(make(figures) for name in tables for make in made.get(name, [partial(flow_table, name=name)]))
 
 
 # --- planning (Sec. IV-G) -----------------------------------------------------------------------------------------
@@ -278,7 +318,6 @@ PLANNERS = {
 OBJECTS, POKES = (1, 2, 3), 10
 OBSTACLE_SCENES, OBSTACLE_TRIES = 3, 5
 AVOIDED = 0.01  # m; an obstacle that was moved by less was avoided
-AHEAD = {"horizon": 2, "candidates": 128}  # getting around an obstacle takes more than one poke
 
 
 def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
@@ -286,7 +325,7 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     planner: of PLANNERS, or "greedy"; movers 0: an obstacle scene. attempt: another one has other random numbers.
     """
-    _, policy, changes = PLANNERS.get(planner, ("", planner, {})) if movers else ("", planner, AHEAD)
+    _, policy, changes = PLANNERS.get(planner, ("", planner, {}))
     run, search = checkpoints.load_run(checkpoint), planning.Search(**changes)
 
     def compute():
@@ -295,22 +334,22 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
-        "settings": asdict(control.settings_for(run))}), compute)
+        "settings": control.settings_for(run).plain}), compute)
 
 
 def outcome(record):
     """What the tables need of a record of `control.closed_loop` -> dict. distance_m (POKES + 1): mean over the movers
     after every poke; others_shifted_m: the farthest that any other object was moved from its place; angles_deg: of
-    movers that are not round, at first and at last.
+    movers that are not round, at first and at last; stopped: why it ended.
     """
     distance, angles = record["distance"].mean(axis=1), record["angle"][[0, -1]]
     others = np.delete(record["poses"][..., :2], record["movers"], axis=1)
     return {"distance_m": np.pad(distance, (0, POKES + 1 - len(distance)), "edge").tolist(),  # it stopped: all stays
             "others_shifted_m": float(np.linalg.norm(others - others[0], axis=2).max()),
-            "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist()}
+            "angles_deg": np.degrees(angles[:, np.isfinite(angles[0])]).tolist(), "stopped": record["stopped"]}
 
 
-def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
+def reproduce_planning(out, checkpoint, scenes=20, map=map):
     """The paper's control experiment -> flat dict of figures, curves {(planner, objects): (scenes, pokes + 1) m}.
 
     Scenes that were run before, with the same checkpoint and planners, are not run again.
@@ -318,7 +357,7 @@ def reproduce_planning(out, checkpoint, scenes=20, jobs=1):
     seeds = [seed for seed in range(scenes + 1) if seed != TRAIN_SEED][:scenes]
     todo = list(product(PLANNERS, OBJECTS, seeds, [0]))
     todo += product(("learned", "greedy"), [0], range(OBSTACLE_SCENES), range(OBSTACLE_TRIES))
-    return summarise_planning(dict(run_all(partial(run_scene, checkpoint, out), todo, jobs)))
+    return summarise_planning(dict(zip(todo, map(partial(run_scene, checkpoint, out), *zip(*todo)))))
 
 
 def summarise_planning(results):
@@ -331,7 +370,8 @@ def summarise_planning(results):
     figures, curves = {}, {}
     for planner, movers in product(PLANNERS, OBJECTS):
         curve = curves[planner, movers] = np.array([each["distance_m"] for each in of(planner, movers)])
-        found = {"left": curve[:, -1].mean() / curve[:, 0].mean(), "left_sd": (curve[:, -1] / curve[:, 0]).std(ddof=1)}
+        left = curve[:, -1] / curve[:, 0]
+        found = {"left": curve[:, -1].mean() / curve[:, 0].mean(), "left_sd": left.std(ddof=1), "worst": left.max()}
         start, end = (np.concatenate([each["angles_deg"][i] for each in of(planner, movers)]) for i in (0, 1))
         if len(start):
             found.update(angle_start_deg=np.median(start), angle_deg=np.median(end))
@@ -339,6 +379,7 @@ def summarise_planning(results):
     learned, oracle = (sum(curves[planner, movers][:, -1].mean() for movers in OBJECTS)
                        for planner in ("learned", "oracle"))
     figures["plan_over_oracle"] = float(learned / oracle)
+    figures["plan_worst_scene"] = max(figures[f"learned_{movers}_worst"] for movers in OBJECTS)
     for planner in ("learned", "greedy"):
         shifts = np.array([each["others_shifted_m"] for each in of(planner, 0)])
         figures[f"{planner}_obstacle_avoided"] = float(np.mean(shifts < AVOIDED))

@@ -2,28 +2,26 @@
 
 pybullet is imported only when an Arena is made; everything else in the package works without it.
 """
-import importlib
-import os
 import tempfile
-from dataclasses import asdict, dataclass, fields
-from functools import partial
+from dataclasses import dataclass, fields
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 
 from .. import check_whole
-from ..disk.files import whole_file
+from ..disk.files import plain, whole_file
 from ..geometry import Camera
 from ..interactions import cell_centres, finger_fits, occupied_grid
 from ..scene import scene_of
+from .bodies import ROUND, add_own, measure, new_world
 from .objects import KINDS, TEXTURES, draw_shape, draw_texture, mesh, prism
 
 MAX_OBJECTS = 7
 TIME_STEP = 1 / 240  # s
 SUPERSAMPLE = 3  # odd: the middle sample of a block of rays lies on the pixel's centre
 NEAR, FAR = 0.2, 2.0  # m from the camera; the renderer sees what lies between
+TOPPLING = 720  # steps that a scene of own objects has to come to rest in: they may fall over
 PARK_HEIGHT = 1.0  # m; the finger waits up here, out of the camera's sight
 
 
@@ -32,17 +30,18 @@ class Settings:
     """Everything that decides what the simulator draws. Lengths in m, force in N, speed in m/s, pictures in pixels.
 
     The finger's path has a length within `poke_length`; scenes are thrown away after `pokes_per_scene`.
-    `place_within` is the part of the arena in which a new scene's objects are put down.
+    `place_within` is the part of the arena in which a new scene's objects are put down. own: objects of one's own
+    (sim/bodies.py); with some, half of all objects are of these, and all of them where `kinds` is empty.
     Raises ValueError naming what cannot work.
     """
     objects_min: int = 3
-    objects_max: int = 4
-    kinds: tuple = ("carton", "can", "bracket", "pot")
+    objects_max: int = MAX_OBJECTS
+    kinds: tuple = ("carton", "can", "bracket", "pot", "book")
     textures: tuple = ("stripes", "checks", "dots", "patches")
     arena: float = 0.5
     cell: float = 0.025
     wall_height: float = 0.03
-    place_within: float = 0.7
+    place_within: float = 0.95
     pokes_per_scene: int = 6
     poke_length: tuple = (0.10, 0.14)
     finger_radius: float = 0.01
@@ -50,6 +49,7 @@ class Settings:
     finger_speed: float = 0.25
     width: int = 64
     height: int = 48
+    own: tuple = ()
 
     def __post_init__(self):
         for name, kind, value in [(field.name, field.type, getattr(self, field.name)) for field in fields(self)]:
@@ -59,9 +59,11 @@ class Settings:
                 raise ValueError(f"{name}: expected a finite number > 0, got {value}")
         cells, length = self.arena / self.cell, self.poke_length
         paths = isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena
+        own = isinstance(self.own, tuple) and all(hasattr(each, "add") and hasattr(each, "plain") for each in self.own)
         for good, name, expected in (
                 (self.objects_min <= self.objects_max <= MAX_OBJECTS, "objects_max", f"objects_min to {MAX_OBJECTS}"),
-                (self.kinds and set(self.kinds) <= set(KINDS), "kinds", f"some of {', '.join(KINDS)}"),
+                ((self.kinds or self.own) and set(self.kinds) <= set(KINDS), "kinds", f"some of {', '.join(KINDS)}"),
+                (own, "own", "a tuple of what read_urdfs makes, or of other objects that have add and plain"),
                 (self.textures and set(self.textures) <= set(TEXTURES), "textures", f"some of {', '.join(TEXTURES)}"),
                 (self.arena <= 0.5, "arena", "at most 0.5 m, which the camera sees"),
                 (abs(cells - round(cells)) < 1e-6, "cell", "one that the arena has a whole number of"),
@@ -70,6 +72,16 @@ class Settings:
                 (16 <= self.width <= 1280 and self.width * 3 == self.height * 4, "width", "4/3 of height, 16 to 1280")):
             if not good:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
+
+    @property
+    def plain(self):
+        """As data sets record it, plain JSON types. Own objects appear where there are any: older ones know of none."""
+        own = {"own": [each.plain for each in self.own]} if self.own else {}
+        return plain({**{name: value for name, value in vars(self).items() if name != "own"}, **own})
+
+
+# Fewer objects, none that topples, near the middle: what a model learns within minutes. data_small is made so.
+MIDDLE = {"objects_max": 4, "place_within": 0.7, "kinds": ("carton", "can", "bracket", "pot")}
 
 
 # --- the camera ---------------------------------------------------------------------------------------------------
@@ -87,39 +99,22 @@ def arena_camera(width, height):
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, pose)
 
 
-def import_quietly(name):
-    """Import a module whose C code prints to stderr when it is imported, as Bullet's does."""
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 2)
-    try:
-        return importlib.import_module(name)
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
-
-
 # --- the arena ----------------------------------------------------------------------------------------------------
 
 class Arena:
     """One Bullet world: a walled table, a finger on three prismatic joints, a camera. A context manager.
 
-    Of the present scene's objects: bodies, Bullet's numbers; kinds; radii, how far their corners lie from the middle,
-    m. empty_depth (H, W) m: the arena without any. bullet: Bullet's functions, for this world. All is drawn from the
-    Generator `rng`. Raises RuntimeError where pybullet is not installed.
+    Of the present scene's objects: bodies, Bullet's numbers; kinds, names of own objects among them; and, measured as
+    they lay when the scene began, radii, how far they reach from their middles in the plane, m, and round, whether
+    their shape would hide a turn about the vertical. empty_depth (H, W) m: the arena without any. bullet: Bullet's
+    functions, for this world. All is drawn from the Generator `rng`. Raises RuntimeError where pybullet is not
+    installed.
     """
 
     def __init__(self, settings, rng):
-        try:
-            pybullet = import_quietly("pybullet")
-        except ImportError:
-            raise RuntimeError("the simulator needs pybullet, which is not installed: pip install pybullet "
-                               "(ready-made for Python 3.11 and older; later versions compile it)") from None
-        world = pybullet.connect(pybullet.DIRECT)
-        self.bullet = SimpleNamespace(**{name: partial(value, physicsClientId=world) if callable(value) else value
-                                         for name, value in vars(pybullet).items()})
+        self.bullet = new_world()
         self.settings, self.rng, self.camera = settings, rng, arena_camera(settings.width, settings.height)
-        self.bodies, self.kinds, self.radii = [], [], []
+        self.bodies, self.kinds, self.radii, self.round = [], [], [], []
         self._build()
         self.empty_depth = self.observe()[1]
 
@@ -190,27 +185,54 @@ class Arena:
 
         Raises ValueError when they do not fit in 100 tries.
         """
-        s, rng = self.settings, self.rng
+        s = self.settings
         for _ in range(100):
             for body in self.bodies:
                 self.bullet.removeBody(body)
             self.bodies, self.kinds, self.radii, places = [], [], [], []
-            for _ in range(rng.integers(s.objects_min, s.objects_max + 1)):
-                kind = s.kinds[rng.integers(len(s.kinds))]
-                shape = draw_shape(kind, rng)
-                radius = max(np.linalg.norm(outline, axis=1).max() for outline in shape[0])
-                for _ in range(100):
-                    xy = rng.uniform(-0.5, 0.5, 2) * s.arena * s.place_within
-                    if all(np.linalg.norm(xy - place) > radius + other + 0.004
-                           for place, other in zip(places, self.radii)):
-                        places.append(xy)
-                        self.radii.append(radius)
-                        self.kinds.append(kind)
-                        self.bodies.append(self._add_object(kind, *shape, xy))
-                        break
-            if len(self.bodies) >= s.objects_min and self.settle():
+            for _ in range(self.rng.integers(s.objects_min, s.objects_max + 1)):
+                self._put_down(self._draw_kind(), places)
+            if len(self.bodies) >= s.objects_min and self.settle(TOPPLING if s.own else 240):
+                extents = [measure(self.bullet, body) for body in self.bodies]
+                self.radii = [extent.radius for extent in extents]
+                self.round = [extent.roundness > ROUND for extent in extents]
                 return
         raise ValueError(f"objects: {s.objects_min} do not fit into {s.place_within:.0%} of a {s.arena} m arena")
+
+    def _draw_kind(self):
+        """A kind's name, or an object of one's own."""
+        groups = [group for group in (self.settings.kinds, self.settings.own) if group]
+        group = groups[self.rng.integers(2)] if len(groups) > 1 else groups[0]
+        return group[self.rng.integers(len(group))]
+
+    def _put_down(self, kind, places):
+        """Put an object where there is room for it, apart from those at `places`, which grows; if there is."""
+        s, rng, own = self.settings, self.rng, not isinstance(kind, str)
+        if own:
+            body, extent = add_own(self.bullet, kind, rng)
+            radius = extent.radius
+        else:
+            shape = draw_shape(kind, rng)
+            radius = max(np.linalg.norm(outline, axis=1).max() for outline in shape[0])
+        reach = min(s.arena * s.place_within / 2, s.arena / 2 - radius - 0.004)  # clear of the walls
+        for _ in range(100):
+            xy = rng.uniform(-reach, reach, 2)
+            if all(np.linalg.norm(xy - place) > radius + other + 0.004 for place, other in zip(places, self.radii)):
+                places.append(xy)
+                self.radii.append(radius)
+                self.kinds.append(kind.plain["name"] if own else kind)
+                self.bodies.append(self._stand(body, extent, xy) if own else self._add_object(kind, *shape, xy))
+                return
+        if own:
+            self.bullet.removeBody(body)
+
+    def _stand(self, body, extent, xy):
+        """Stand a body that was just made on the table, turned about the vertical at random -> its number."""
+        p, angle = self.bullet, self.rng.uniform(0, 2 * np.pi)
+        turn = [0, 0, np.sin(angle / 2), np.cos(angle / 2)]
+        turned = p.multiplyTransforms([0, 0, 0], turn, [0, 0, 0], p.getBasePositionAndOrientation(body)[1])[1]
+        p.resetBasePositionAndOrientation(body, [*xy, extent.below + 0.001], turned)
+        return body
 
     def _add_object(self, kind, outlines, area, height, taper, xy):
         p, rng, (density, friction) = self.bullet, self.rng, KINDS[kind][-2:]
@@ -297,7 +319,7 @@ class Arena:
         Paper: Sec. IV-A. The picture, (H, W, 3) uint8 and (H, W) m -> poke (3,), start (2,) float32, or None where no
         start is free.
         """
-        s, settings = self.settings, asdict(self.settings)
+        s, settings = self.settings, vars(self.settings)
         scene = scene_of(depth[None], rgb[None], self.empty_depth, self.camera, s.arena)
         grid, centres = occupied_grid(scene.points, scene.occupied[0], settings), cell_centres(settings)
         if not grid.any():

@@ -1,13 +1,12 @@
 """Collection: shards of pokes, each in a Bullet world with its own seed. Paper: Sec. IV-A and IV-B."""
 from collections import Counter
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from .. import check_whole
-from ..disk.files import plain
+from ..disk.files import claim, clear_away, plain
 from ..disk.shards import find_shards, load_shard, save_shard
 from ..interactions import Interactions
 from .arena import Arena, Settings
@@ -45,7 +44,7 @@ def collect_shard(settings, seed, index, pokes, world=None):
     befores, afters, drawn, starts = zip(*kept)
     rgb_before, depth_before, labels, poses_before = map(np.stack, zip(*befores))
     rgb_after, depth_after, _, poses_after = map(np.stack, zip(*afters))
-    meta = plain({"seed": seed, "shard": index, "settings": asdict(settings), "counts": dict(counts)})
+    meta = plain({"seed": seed, "shard": index, "settings": settings.plain, "counts": dict(counts)})
     interactions = Interactions(rgb_before, rgb_after, depth_before, depth_after, np.stack(drawn), np.stack(starts),
                                 arena.empty_depth, arena.camera, meta)
     return interactions, Truth(labels, poses_before, poses_after)
@@ -62,36 +61,45 @@ def _outcome(before, after, count, at_rest, settings):
     return "kept" if all(seen) else "out_of_view"
 
 
-def _collect_file(settings, seed, job):
-    index, path, pokes = job
+def _collect_file(settings, seed, path, job):
+    index, pokes = job
     interactions, truth = collect_shard(settings, seed, index, pokes)
     save_truth(path, truth, interactions)  # first, so that a shard never lacks its truth
     save_shard(path, interactions)
     return interactions.meta["counts"]
 
 
-def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None):
+def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None, part=(1, 1)):
     """Collect `pokes` interactions into `folder`; shards already there from the same call are kept.
 
-    map: as Python's; that of a pool of processes collects several shards at a time. progress(done, total) is called
-    after every shard. Returns the counts of kept and dropped pokes, a dict.
+    map: as Python's; that of an executor collects several shards at a time. progress(done, total) is called after every
+    shard. part: (i, n) collects every n-th shard alone, from the i-th on; others, also at the same time and on other
+    machines, the rest. Returns the counts of kept and dropped pokes, a dict.
     Raises ValueError for bad counts or a folder with other data in it.
     """
     check_whole("pokes", pokes, 1, MOST_POKES)
     check_whole("seed", seed, 0)
-    counts, jobs = Counter(), {}
+    check_whole("part: of how many", part[1], 1)
+    check_whole("part", part[0], 1, part[1])
+    folder, counts, jobs = Path(folder).absolute(), Counter(kept=0), {}
     for index, first in enumerate(range(0, pokes, SHARD_POKES)):
-        path = Path(folder) / f"shard_{index:04d}.npz"
-        jobs[path] = index, path, min(SHARD_POKES, pokes - first)
-    for path in find_shards(folder):
-        old, (_, _, size) = load_shard(path), jobs.get(path, (None, None, 0))
-        if (old.meta["seed"], old.settings, len(old)) != (seed, plain(asdict(settings)), size):
+        jobs[folder / f"shard_{index:04d}.npz"] = index, min(SHARD_POKES, pokes - first)
+    there, made_of = find_shards(folder), plain({"seed": seed, "settings": settings.plain})
+    jobs_of_part = dict([*jobs.items()][part[0] - 1::part[1]])
+    total = sum(size for _, size in jobs_of_part.values())
+    for path in there:
+        if path in jobs and path not in jobs_of_part:
+            continue  # another's to judge
+        old, (_, size) = load_shard(path), jobs.get(path, (None, 0))
+        if (old.meta["seed"], old.settings, len(old)) != (seed, made_of["settings"], size):
             raise ValueError(f"{path}: holds data of another seed, other settings or another number of pokes")
         if truth_path(path).exists():
             counts.update(old.meta["counts"])
-            del jobs[path]
-    for made in map(partial(_collect_file, settings, seed), jobs.values()):
+            del jobs_of_part[path]
+    claim(folder / "collection.json", made_of)
+    clear_away(folder.iterdir())
+    for made in map(partial(_collect_file, settings, seed), jobs_of_part, jobs_of_part.values()):
         counts.update(made)
         if progress:
-            progress(counts["kept"], pokes)
+            progress(counts["kept"], total)
     return dict(counts)

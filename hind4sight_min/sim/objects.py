@@ -34,7 +34,7 @@ KINDS = {
               [(0.060, 0.085), (0.050, 0.070)], (0.030, 0.055), None, 1200.0, (0.50, 0.75)),
     "cross": (lambda a, b: [rectangle(-a, -b, a, b), rectangle(-b, b, b, a), rectangle(-b, -a, b, -b)],
               [(0.034, 0.044), (0.012, 0.016)], (0.030, 0.045), None, 900.0, (0.50, 0.70)),
-    # Stands on its edge and topples now and then. Neither among the defaults, which it would change, nor held out.
+    # Stands on its edge and topples now and then.
     "book": (lambda a, b: [rectangle(-a, -b, a, b)],
              [(0.028, 0.036), (0.0075, 0.0095)], (0.060, 0.070), (0.75, 0.95), 700.0, (0.70, 0.95)),
 }

@@ -59,17 +59,17 @@ def photographs(interactions, truth, rows, width=640):
     found = _read(interactions, rows)
     if truth is None or not {"seed", "shard"} <= set(interactions.meta):
         return found
-    settings = Settings(**{name: tuple(value) if isinstance(value, list) else value
-                           for name, value in interactions.settings.items()})
     for shard in sorted({row // SHARD_POKES for row in rows if row not in found}):
         first, taken = shard * SHARD_POKES, {}
         wanted = {row - first for row in rows if row // SHARD_POKES == shard}
         count = max(wanted) + 1
         part = slice(first, first + count)
         try:
+            settings = Settings(**{name: tuple(value) if isinstance(value, list) else value
+                                   for name, value in interactions.settings.items()})
             collect_shard(settings, interactions.meta["seed"], interactions.meta["shard"] + shard, count,
                           partial(Replay, interactions[part], truth[part], wanted, width, taken))
-        except (RuntimeError, ValueError):  # no pybullet, or another simulator than these pokes are from
+        except (RuntimeError, TypeError, ValueError):  # no pybullet, or another simulator than these pokes are from
             pass
         found.update({first + row: pair for row, pair in taken.items()})
     return found
