@@ -56,9 +56,9 @@ def recorded():
     return load_run(data_small() / "checkpoint.npz"), data, truth, scenes_of_pokes(truth)
 
 
-def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorded):
+def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorded, tmp_path):
     run, data, _, _ = recorded
-    explorer = opened()
+    explorer = opened(out=tmp_path)
     before = screen(explorer)
     np.testing.assert_array_equal(explorer.poke, data.pokes[0], err_msg="it begins with the recorded poke")
     np.testing.assert_allclose(explorer.flow, ask(run, data, 0).flow, atol=1e-4)
@@ -68,6 +68,9 @@ def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorde
         target, tip = (project(np.append(place, explorer.scene.points[0, 64 * y + x, 2]), data.camera) for place in (
             explorer.poke[:2], explorer.poke[:2] + 0.05 * explore.direction(explorer.poke)))
         np.testing.assert_allclose(target, (x, y), atol=1e-2, err_msg="the target is what was clicked")
+        start, end = explorer.art.arrows[2]._posA_posB  # from above, m
+        np.testing.assert_allclose(end, explorer.poke[:2], err_msg="the arrow does not follow")
+        assert (end - start) @ explore.direction(explorer.poke) > 0.099, "it comes from 10 to 14 cm behind"
         assert (tip - target) @ [to_x - x, to_y - y] > 0.99 * 6 * np.linalg.norm(tip - target), "dragged another way?"
         assert np.abs(np.angle(np.exp(1j * (explorer.poke[2] - angle)))) < 0.5
     said = predict(run.params, run.recipe.sizes, scenes_of(data[[0]])[0], explorer.poke[None])
@@ -81,6 +84,8 @@ def test_a_drag_is_a_poke_and_what_is_drawn_is_what_the_model_says_of_it(recorde
     frozen = screen(explorer)
     explorer.canvas.draw()
     np.testing.assert_array_equal(screen(explorer), frozen, err_msg="drawing all shows something else than blitting")
+    do(explorer, "key s")
+    np.testing.assert_array_equal(np.array(Image.open(tmp_path / "explore_1.png")), frozen, err_msg="saved incompletely")
 
 
 def test_poke_shows_the_truth_with_the_error_and_is_taken_back(recorded):
@@ -174,7 +179,7 @@ def test_an_error_in_a_student_s_code_is_a_line_under_the_pictures(tmp_path, mon
 def test_in_the_simulator_every_poke_can_be_tried_and_taken_back():
     explorer = opened(data=None, seed=1)
     x, y = on_object(explorer)
-    first = shown(explorer, "camera")
+    first, poses = shown(explorer, "camera"), explorer.world.arena.poses()
     assert first.shape[0] > 48, "people are shown the fine picture"
     for to_x in (x + 6, x - 6):  # the finger finds room on one side at least
         do(explorer, f"drag {x} {y} {to_x} {y}", "key space")
@@ -184,6 +189,7 @@ def test_in_the_simulator_every_poke_can_be_tried_and_taken_back():
     assert shown(explorer, "truth").shape == (48, 64, 3) and len(explorer.art.true.get_segments())
     do(explorer, "key u")
     np.testing.assert_array_equal(shown(explorer, "camera"), first)
+    np.testing.assert_allclose(explorer.world.arena.poses(), poses, atol=1e-6, err_msg="the picture alone went back")
     do(explorer, "key n")
     assert (shown(explorer, "camera") != first).any() and not explorer.world.history
     explorer.world.arena.__exit__()
@@ -196,7 +202,7 @@ def test_a_script_saves_pictures_and_is_filmed(tmp_path, capsys, monkeypatch):
     (tmp_path / "script").write_text("drag 30 20 34 16  # a poke\nkey space\n\nwait 0.5\nkey s\n")
     assert main(["explore", str(FOLDER), "--script", "script", "--demo", "out.gif"]) == 0
     with Image.open("explore_1.png") as picture, Image.open("out.gif") as film:
-        assert picture.size == (975, 585) == film.size and film.n_frames > 3
+        assert picture.size == (930, 532) == film.size and film.n_frames > 3
     assert capsys.readouterr().out == "out.gif: 3 s\n"
 
 

@@ -32,7 +32,7 @@ from .worlds import world_of
 
 KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goals  [g]", "p": "plan  [p]",
         "s": "save  [s]"}
-SIZE = 13.0, 7.8  # inches
+SIZE = 12.4, 7.1  # inches: fits a small laptop
 SAME = 0.03  # m; a mark takes the place of one so near
 
 

@@ -283,7 +283,7 @@ def _draw_motion(panels, interactions, row, answer, truth):
     for name, title in (("flow", "Predicted optical flow\n(U, V), Sec. III-C"), ("true_flow", "True optical flow\n")):
         if name in flows:
             show_flow(panels[name], flows[name], scale, title)
-    draw_wheel(panels["flow"], scale, low=poke[1] > 0)  # away from the target
+    draw_wheel(panels["flow"], scale, low=poke[1] >= start[1])  # what moves upwards leaves room below
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      interactions.settings["arena"])
 
@@ -395,7 +395,7 @@ def explorer_panels(figure, camera, settings, buttons):
         rings=view.plot([], [], "o", color=GOAL, markersize=11, fillstyle="none", markeredgewidth=2,
                         path_effects=OUTLINE)[0],
         stars=view.plot([], [], "*", color=GOAL, markersize=13, markeredgecolor="black")[0],
-        text=figure.text(0.012, 0.068, "", fontsize=10.5),
+        text=view.text(0.012, 0.068, "", fontsize=10.5, transform=figure.transFigure),
         buttons={key: figure.text(0.02 + 0.125 * i, 0.022, text, bbox={"boxstyle": "round", "facecolor": BLANK,
                                                                        "edgecolor": "0.5"})
                  for i, (key, text) in enumerate(buttons.items())})
@@ -424,12 +424,12 @@ def save_sequence(path, record, camera):
     if "goal_rgb" in record:
         beside.append(([record.get("goal_photograph", record["goal_rgb"])] * (last + 1), "the goal\n"))
     figure = Figure(figsize=(4.2 * (1 + len(beside)), 3.7), dpi=80)
-    figure.subplots_adjust(left=0.01, right=0.99, top=0.88, bottom=0.02, wspace=0.04)
+    margins = {"left": 0.01, "right": 0.99, "top": 0.88, "bottom": 0.02, "wspace": 0.04}
     writer, place = PillowWriter(fps=1), {"extent": (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)}
     with whole_file(path) as temporary, writer.saving(figure, str(temporary), dpi=80):
         for t, picture in enumerate(pictures):
             figure.clear()
-            panels = figure.subplots(1, 1 + len(beside), squeeze=False)[0]
+            panels = figure.subplots(1, 1 + len(beside), squeeze=False, gridspec_kw=margins)[0]
             title = f"after {t} pokes: {distance[t]:.1f} cm to go"
             show_image(panels[0], picture, title if t == last else f"{title}\nnext: poke {t + 1}", **place)
             _draw_marks(panels[0], record, t, camera)
