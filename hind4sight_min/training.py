@@ -13,8 +13,7 @@ from .networks import Sizes, init_parameters, inverse_model, predict, state_embe
 from .ops import at_rows, take, unflatten
 from .scene import Scene, crop, look, most_changed, scene_of
 
-# From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
-# See docs/research-log.md.
+# From an audit of gradient norms, not of the terms' values; the photometric one from what turns need (research log).
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
            "binary_masks": 0.5}
 

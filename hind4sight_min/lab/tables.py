@@ -27,7 +27,9 @@ from .runs import train_saving
 
 @dataclass(frozen=True)
 class Scale:
-    """train_pokes, test_pokes: how many (of each of TESTS, times its factor). steps: of every cell of the tables; long_steps: of the headline models."""
+    """train_pokes, test_pokes: how many, of each of TESTS times its factor. steps: of every cell of the tables;
+    long_steps: of the headline models.
+    """
     train_pokes: int = 48000
     test_pokes: int = 1000
     steps: int = 3000
@@ -239,7 +241,8 @@ def summarise(results, scale):
             figures[f"{group}_{metric}"] = float(np.mean(values))
             figures[f"{group}_{metric}_sd"] = float(np.std(values, ddof=1))
     for (worse, better), noise in product(ORDER, NOISES):
-        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])] for model in (worse, better)]
+        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])]
+                for model in (worse, better)]
         if all(ours):
             less, name = np.subtract(*ours), f"{worse}_less_{better}_{noise}"
             figures[name] = float(less.mean())
@@ -276,7 +279,7 @@ def flow_table(figures, name):
 
 def order_table(figures):
     """How sure the order of the ablation is: differences within a seed, ours with their interval, and the paper's."""
-    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval over seeds")]
+    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval")]
     for (worse, better), (i, noise) in product(ORDER, enumerate(NOISES)):
         name, paper = f"{worse}_less_{better}_{noise}", MODELS[worse][3][i] - MODELS[better][3][i]
         if name in figures:
