@@ -134,11 +134,15 @@ def test_half_of_the_objects_are_own_where_there_are_kinds_too_and_all_where_the
             for _ in range(10):
                 arena.new_scene()
                 drawn += arena.kinds
-                assert arena.bullet.getNumBodies() == 7 + 6, "what found no room is left"
                 for i, body in enumerate(arena.bodies):
                     assert not any(arena.bullet.getClosestPoints(body, other, 0.002) for other in arena.bodies[:i])
         assert set(drawn) == {*kinds, "2.urdf", "3.urdf", "4.urdf"}
         assert np.mean([name != "can" for name in drawn]) == pytest.approx(share, abs=0.15)
+    settings = Settings(own=own, objects_min=2, objects_max=7, place_within=0.2, **FAST)
+    with Arena(settings, np.random.default_rng(0)) as arena:
+        for _ in range(5):
+            arena.new_scene()
+            assert arena.bullet.getNumBodies() == len(arena.bodies) + 6, "what found no room is left"
 
 
 @dataclass(frozen=True)
