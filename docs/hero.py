@@ -32,7 +32,7 @@ WIDTH, HEIGHT = 384, 288  # px of a photograph; two stand side by side, pixel by
 CANVAS = 800, 370  # px
 SEEN = 0.05  # m, on average over the points that move: what is long enough to see
 CARD, INK, DIM = "#22272e", "#f0f3f6", "#adbac7"  # a card of its own, for light pages and dark ones
-COLOURS = 128
+COLOURS = 255
 
 
 # --- what happens -------------------------------------------------------------------------------------------------
@@ -129,8 +129,9 @@ class Stage:
 
     def save(self, path):
         """Write the frames as a GIF with one palette, whole or not at all."""
-        few = np.concatenate(self.frames[::max(1, len(self.frames) // 10)])
-        palette = Image.fromarray(few).quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
+        marks = np.uint8(255 * PALETTE)[np.arange(CANVAS[0]) * len(PALETTE) // CANVAS[0]]
+        few = [np.tile(marks, (100, 1, 1)), *self.frames[::max(1, len(self.frames) // 10)]]  # small marks keep theirs
+        palette = Image.fromarray(np.concatenate(few)).quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
         first, *others = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
                           for frame in self.frames)
         with whole_file(path) as temporary:

@@ -495,7 +495,7 @@ def control_figure(curves, pokes):
                  xticks=range(0, pokes + 1, 2))
         axes.grid(alpha=0.3, axis="y")
     figure.axes[0].set_ylabel("mean distance to the goals [cm]")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize=9)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
     figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
     return figure
 
