@@ -466,7 +466,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "checkpoint": SHIPPED,
         "data": {"nargs": "?", "help": "a folder of pokes to explore, in place of the simulator"},
         "--seed": {**SEED, "help": "which scene"},
-        "--mine": {"nargs": "+", "default": (), "metavar": "FOLDER", "help": "take what a student wrote there in "
+        "--mine": {"nargs": "+", "metavar": "FOLDER", "help": "take what a student wrote there in "
                    "place of the reference's functions; their code runs with all your rights"},
         "--script": {"metavar": "FILE", "help": "no window: do what the file says (docs/explorer.md)"},
         "--demo": {"metavar": "OUT.gif", "help": "no window: film the script, or one of our own"},

@@ -320,7 +320,7 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
     minds the mouse. Raises RuntimeError where it can do neither.
     """
     run = load_run(checkpoint or data_small() / "checkpoint.npz")
-    yours = [name for folder in mine for name in take_written(folder)]
+    yours = [name for folder in mine or () for name in take_written(folder)]
     if figure is None:
         import matplotlib.pyplot as plt
         with rc_context({"toolbar": "None"}):
