@@ -2,10 +2,10 @@
 
     python benchmarks/kills.py --json docs/results/kills.json
 
-The same small work is done undisturbed and, in processes that are killed and started again, disturbed. What was finished
-before a kill must be there afterwards, byte by byte; in training all but the last SAVE_EVERY seconds; and in the end
-nothing may differ. Ten of the kills in collection come while a shard is being written. The cluster is Dask's (the extra
-`cluster`), a scheduler and two workers here; without it that part is left out. Five minutes.
+The same small work is done undisturbed and, in processes that are killed and started again, disturbed. What was
+finished before a kill must be there afterwards, byte by byte; in training all but the last SAVE_EVERY seconds; and in
+the end nothing may differ. Ten of the kills in collection come while a shard is being written. The cluster is Dask's
+(the extra `cluster`), a scheduler and two workers here; without it that part is left out. Five minutes.
 """
 import argparse
 import json
@@ -207,7 +207,8 @@ def main():
         if find_spec("distributed"):
             figures["kills_workers"], identical = kill_workers(folder / "cluster", of_workers, args.pokes)
             figures["cluster_identical"] = float(identical)
-        figures["kills_survived"] = sum(figures.get(f"kills_{name}", 0) for name in ("collection", "training", "workers"))
+        figures["kills_survived"] = sum(figures.get(f"kills_{name}", 0) for name in (
+            "collection", "training", "workers"))
     write_json(args.json, figures)
 
 

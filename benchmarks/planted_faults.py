@@ -40,8 +40,8 @@ PLANTED = (
     ("geometry.py", "geometry eq1_transform", [
         ("principal point in the picture's middle", "np.arange(camera.width) - camera.cx",
          "np.arange(camera.width) - camera.width / 2"),
-        ("fx for both axes", "np.array([camera.fx, camera.fy], points_arena.dtype)",
-         "np.array([camera.fx, camera.fx], points_arena.dtype)"),
+        ("fx for both axes", "np.array([camera.fx, camera.fy], points_camera.dtype)",
+         "np.array([camera.fx, camera.fx], points_camera.dtype)"),
         ("rotations transposed", "anp.swapaxes(rotations, 2, 3)", "rotations"),
         ("turned into the poke's frame before it is shifted", "np.matmul(points - origins[:, None], axes)",
          "np.matmul(points, axes) - origins[:, None]")]),

@@ -13,6 +13,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from race import DATA, parser_of
 
@@ -39,11 +40,10 @@ def largest_gap(made, found, shift=0.0):
 
 
 def truth_at(truth, size):
-    """The Truth with labels of pictures of `size` (W, H): those of the pixel in the middle of each block."""
-    height, width = truth.labels.shape[1:]
-    rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
-    columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
-    return replace(truth, labels=truth.labels[:, rows[:, None], columns])
+    """The Truth with labels of pictures of `size` (W, H): each block's most frequent one."""
+    def shares(labels):
+        return [cv2.resize(np.float32(labels == label), size, interpolation=cv2.INTER_AREA) for label in range(8)]
+    return replace(truth, labels=np.stack([np.argmax(shares(each), axis=0) for each in truth.labels]).astype(np.uint8))
 
 
 def main():

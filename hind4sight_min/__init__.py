@@ -4,6 +4,7 @@ The core, in the order to read it: geometry, ops, losses, interactions, scene, n
 `disk/`, files; `sim/`, the poke simulator; `lab/`, the experiments and the command line: the core imports none of them.
 """
 import ctypes
+import math
 import numbers
 import os
 
@@ -21,6 +22,8 @@ try:
 except (OSError, AttributeError, TypeError):  # another C library
     pass
 
+import numpy as np  # noqa: E402: only now
+
 __version__ = "0.1.0"
 
 
@@ -28,19 +31,69 @@ def check_whole(name, value, least, most=float("inf")):
     """Raise a ValueError that says what is wrong unless `value` is a whole number from `least` to `most`."""
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not least <= value <= most:
         limit = f" and <= {most}" if most < float("inf") else ""
-        raise ValueError(f"{name}: expected a whole number >= {least}{limit}, got {value}")
+        raise ValueError(f"{name}: expected a whole number >= {least}{limit}, got {str(value):.99}")
 
 
-def check_arrays(**arrays):
-    """Raise a ValueError naming the array that is not of as many interactions as the first, or of another type than
-    bool for `valid`, whole numbers for `cells` and floating-point ones for all else: NumPy would let it pass.
+def check_number(name, value, least=-float("inf"), above=-float("inf")):
+    """Raise a ValueError that says what is wrong unless `value` is a finite number, from `least` on and above `above`.
     """
-    count = len(next(iter(arrays.values())))
-    for name, value in arrays.items():
-        kinds, expected = ("f", "floating-point numbers")
-        if "valid" in name:
-            kinds, expected = ("b", "bool")
-        elif name == "cells":
-            kinds, expected = ("iu", "whole numbers")
-        if value.dtype.kind not in kinds or len(value) != count:
-            raise ValueError(f"{name}: expected {expected} of {count} interactions, got {value.dtype} of {len(value)}")
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not (number and least <= value < float("inf") and above < value):
+        limit = f" > {above}" if above > least else f" >= {least}" if least > -float("inf") else ""
+        raise ValueError(f"{name}: expected a finite number{limit}, got {str(value):.99}")
+
+
+KINDS = (("valid", "b", "bool"), ("cells", "iu", "whole numbers"), ("labels", "iu", "whole numbers"),
+         ("rgb", "u", "uint8"), ("depth", "f", "floating-point metres"), ("", "f", "floating-point numbers"))
+
+
+def as_arrays(patterns, **arrays):
+    """The arrays of a call, in order, as their names say that they are wanted; converted where that is exact -> list.
+
+    `valid` is bool (0 and 1, or 0 and 255, become it), `cells` and `labels` whole numbers, `rgb` uint8, `depth`
+    floating-point metres, all else floating-point numbers (whole ones become it, bytes of `images` in [0, 1]).
+    patterns: of their shapes, as of `fits`, with blanks between.
+    Raises a ValueError naming the array that is none of these or has another shape: NumPy would let it pass.
+    """
+    found, sizes = [], {}
+    for (name, value), pattern in zip(arrays.items(), patterns.split(), strict=True):
+        _, kinds, expected = next(each for each in KINDS if each[0] in name)
+        try:
+            array = value if hasattr(value, "dtype") else np.asarray(value)  # a box of autograd's stays one
+        except ValueError:  # rows of several lengths
+            array = np.array(None)
+        if isinstance(array, np.ndarray):  # OpenCV takes another byte order for this machine's
+            array = array.astype(array.dtype.newbyteorder("="), copy=False)
+        if array.dtype.kind in "iu" and array.size:
+            if kinds == "b" and (np.isin(array, (0, 1)).all() or np.isin(array, (0, 255)).all()):
+                array = array > 0
+            elif expected == "uint8" and array.dtype != np.uint8 and 0 <= array.min() and array.max() <= 255:
+                array = array.astype(np.uint8)
+            elif "image" in name and array.dtype == np.uint8:
+                array = array / np.float32(255)
+            elif expected == "floating-point numbers" and "image" not in name:
+                array = array.astype(float)
+        found.append(array)
+        right = array.dtype == np.uint8 if expected == "uint8" else array.dtype.kind in kinds
+        if not right or hasattr(array, "mask") or not fits(array.shape, pattern, sizes):
+            shape = ", ".join(str(sizes.get(letter, letter)) for letter in pattern).replace("*", "...")
+            raise ValueError(f"{name}: expected {expected} of shape ({shape}), got {type(value).__name__} of "
+                             f"{array.dtype}, shape {array.shape}")
+    return found
+
+
+def fits(shape, pattern, sizes):
+    """Whether a shape is as a pattern says: one character for every axis. A letter is a size, the same wherever it
+    occurs (`sizes` notes it), a digit itself, `*` in front any axes, `P` at the end H x W pixels in one axis or two.
+    """
+    if pattern[0] == "*":
+        pattern = pattern[1:]
+        shape = shape[max(0, len(shape) - len(pattern)):]
+    if pattern.endswith("P"):
+        pattern = pattern[:-1]
+        if math.prod(shape[len(pattern):]) != sizes["H"] * sizes["W"]:
+            return False
+        shape = shape[:len(pattern)]
+    return len(shape) == len(pattern) and all(size == (int(letter) if letter.isdigit() else
+                                                       sizes.setdefault(letter, size))
+                                              for size, letter in zip(shape, pattern))

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 import autograd.numpy as anp
 import numpy as np
 
+from . import as_arrays, check_number, check_whole
 from .ops import take
 
 
@@ -29,12 +30,11 @@ class Camera:
     arena_from_camera: np.ndarray
 
     def __post_init__(self):
-        if not all(isinstance(size, (int, np.integer)) and size >= 1 for size in (self.width, self.height)):
-            raise ValueError(f"camera: expected a positive whole image size, got {self.width} x {self.height}")
-        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], float)
-        if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
-            raise ValueError(f"camera: expected finite intrinsics with fx, fy > 0, got {intrinsics.tolist()}")
-        pose = np.array(self.arena_from_camera, float)
+        for name in ("width", "height"):
+            check_whole(f"camera: {name}", getattr(self, name), 1)
+        for name in ("fx", "fy", "cx", "cy"):
+            check_number(f"camera: {name}", getattr(self, name), above=0 if name in ("fx", "fy") else -np.inf)
+        pose = np.array(*as_arrays("*", arena_from_camera=self.arena_from_camera), float)
         if pose.shape != (4, 4):
             raise ValueError(f"camera: arena_from_camera must be (4, 4), got {pose.shape}")
         rotation = pose[:3, :3]
@@ -60,12 +60,8 @@ class Camera:
 
 
 def rigid(points, transform):
-    """Apply one (4, 4) transform to points (..., 3): R p + T, in the dtype of the points.
-
-    Raises ValueError for whole-number points, whose dtype would cut the transform down to whole numbers too.
-    """
-    if not np.issubdtype(points.dtype, np.floating):
-        raise ValueError(f"points: expected floating-point metres, got {points.dtype}")
+    """R p + T: one (4, 4) transform of points (..., 3), in their dtype. Raises ValueError for what are no points."""
+    points, = as_arrays("*3", points=points)
     matrix = transform.astype(points.dtype)
     return anp.matmul(points, matrix[:3, :3].T) + matrix[:3, 3]
 
@@ -79,8 +75,7 @@ def unproject(depth, camera):
     become points at the camera: carry `depth > 0` along as the validity mask.
     Raises ValueError for another picture size and for whole-number depth (convert it to metres first).
     """
-    if not np.issubdtype(depth.dtype, np.floating):
-        raise ValueError(f"depth: expected floating-point metres, got {depth.dtype}")
+    depth, = as_arrays("*", depth=depth)
     if depth.shape[-2:] != (camera.height, camera.width):
         raise ValueError(f"depth: expected (..., {camera.height}, {camera.width}) as the camera says, "
                          f"got {depth.shape}")
@@ -101,8 +96,8 @@ def project(points_arena, camera):
     """
     points_camera = rigid(points_arena, camera.camera_from_arena)
     z = anp.maximum(take(points_camera, (..., slice(2, 3))), MIN_DEPTH)
-    focal = np.array([camera.fx, camera.fy], points_arena.dtype)
-    centre = np.array([camera.cx, camera.cy], points_arena.dtype)
+    focal = np.array([camera.fx, camera.fy], points_camera.dtype)
+    centre = np.array([camera.cx, camera.cy], points_camera.dtype)
     return take(points_camera, (..., slice(0, 2))) / z * focal + centre
 
 

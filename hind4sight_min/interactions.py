@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from . import as_arrays
 from .geometry import Camera
 
 PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
@@ -36,7 +37,7 @@ class Interactions:
     meta: dict
 
     def __post_init__(self):
-        count, size = len(self.pokes), (self.camera.height, self.camera.width)
+        count, size = len(*as_arrays("M3", pokes=self.pokes)), (self.camera.height, self.camera.width)
         for name in ("arena", "cell"):
             settings = self.meta.get("settings")
             if not (isinstance(settings, dict) and 0 < settings.get(name, 0) < float("inf")):
@@ -47,13 +48,10 @@ class Interactions:
                     "depth_before": (count, *size), "depth_after": (count, *size),
                     "pokes": (count, 3), "starts": (count, 2), "empty_depth": size}
         for name, shape in expected.items():
-            value = getattr(self, name)
+            value, = as_arrays("*", **{name: getattr(self, name)})
+            setattr(self, name, value)
             if value.shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {value.shape}")
-            kind = np.uint8 if name.startswith("rgb") else np.floating
-            if not np.issubdtype(value.dtype, kind):
-                raise ValueError(f"{name}: expected {'uint8' if kind is np.uint8 else 'floating-point numbers'}, "
-                                 f"got {value.dtype}")
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
             if "depth" in name and not (value.min(initial=0) >= 0 and value.max(initial=0) <= MOST_DEPTH):

@@ -11,7 +11,7 @@ import autograd.numpy as anp
 import numpy as np
 from autograd.tracer import getval
 
-from . import check_arrays
+from . import as_arrays
 from .ops import bilinear_sample, nearest_squared_distances, take
 
 # The paper's exp(-|grad I|) depends on the range of I. Ours is [0, 1], where exp(-40 |grad I|) makes the edge of a true
@@ -41,7 +41,9 @@ def distance_maps(predicted, observed, valid_predicted, valid_observed):
     predicted, observed (B, N, 3) m; valid_* (B, N) bool -> two maps (B, N) m^2, 0 where not valid.
     The first lives on frame t's grid, the second on frame t+1's.
     """
-    check_arrays(predicted=predicted, observed=observed, valid_predicted=valid_predicted, valid_observed=valid_observed)
+    predicted, observed, valid_predicted, valid_observed = as_arrays(
+        "BND BMD BN BM", predicted=predicted, observed=observed, valid_predicted=valid_predicted,
+        valid_observed=valid_observed)
     return (nearest_squared_distances(predicted, observed, valid_observed) * valid_predicted,
             nearest_squared_distances(observed, predicted, valid_predicted) * valid_observed)
 
@@ -80,7 +82,8 @@ def photometric_loss(images, next_images, flow, valid):
     images, next_images (B, H, W, C) in [0, 1]; flow (B, H, W, 2) px; valid (B, N) bool -> (B,).
     Pixels that the flow carries out of view have nothing to be compared with and cost nothing.
     """
-    check_arrays(images=images, next_images=next_images, flow=flow, valid=valid)
+    images, next_images, flow, valid = as_arrays("BHWC BHWC BHW2 BP", images=images, next_images=next_images,
+                                                 flow=flow, valid=valid)
     warped, in_view = warp_backward(next_images, flow)
     counted = np.reshape(valid, in_view.shape) & in_view
     return anp.sum(anp.abs(images - warped) * counted[..., None], axis=(1, 2, 3))  # Eq. (3)
@@ -102,7 +105,7 @@ def edge_aware_smoothness(field, images, valid):
     field (B, H, W, C); images (B, H, W, 3) on the same grid, in [0, 1]; valid (B, N) bool -> (B,), units of the
     field. A step counts where both neighbours are valid.
     """
-    check_arrays(field=field, images=images, valid=valid)
+    field, images, valid = as_arrays("BHWD BHWC BP", field=field, images=images, valid=valid)
     across, down = edge_weights(images)
     valid = np.reshape(valid, images.shape[:3])
     across, down = across * (valid[:, :, 1:] & valid[:, :, :-1]), down * (valid[:, 1:] & valid[:, :-1])
@@ -118,6 +121,7 @@ def flow_smoothness_loss(flow, images, valid):
 
     flow (B, H, W, 2) px; images (B, H, W, 3); valid (B, N) bool -> (B,) px.
     """
+    flow, = as_arrays("*2", flow=flow)
     return edge_aware_smoothness(flow, images, valid)  # Eq. (4)
 
 
@@ -152,7 +156,7 @@ def heatmap_cross_entropy(logits, cells):
 
     -log softmax(logits)[cell].  logits (B, cells), cells (B,) int -> (B,) nats.
     """
-    check_arrays(logits=logits, cells=cells)
+    logits, cells = as_arrays("BN B", logits=logits, cells=cells)
     if not (0 <= cells.min() and cells.max() < logits.shape[1]):  # -1 would be the last
         raise ValueError(f"cells: expected 0 to {logits.shape[1] - 1}, got {cells.min()} to {cells.max()}")
     top = np.max(getval(logits), axis=1, keepdims=True)  # cancels; keeps exp in range
@@ -165,7 +169,7 @@ def embedding_loss(predicted, observed):
 
     (B, E), (B, E) -> (B,), the mean over E, not the sum. What it trains and what not: `networks.state_embedding`.
     """
-    check_arrays(predicted=predicted, observed=observed)
+    predicted, observed = as_arrays("BE BE", predicted=predicted, observed=observed)
     # Not anp.mean: under NumPy 2 autograd's derivative of it turns float32 into float64.
     return anp.sum(anp.abs(predicted - observed), axis=1) / float(predicted.shape[1])
 

@@ -176,13 +176,12 @@ def forward_model(params, sizes, points, valid, pokes, arena=np.inf):
     """F: masks, motions and the next point cloud under a poke. Paper: Sec. III-A, Eq. (1).
 
     points (B, M, 3) m arena, a set, those that `scene.look` found; valid (B, M) bool, which of them count; pokes
-    (B, 3), (m, m, rad); arena: its side in m -> Prediction of these points. The poke enters only as a frame, x along it and its target the
-    origin, that all but the encoder sees points in: where the finger came down is not told, as in the paper's u_t.
+    (B, 3), (m, m, rad); arena: its side, m -> Prediction of these points. The poke enters only as a frame, x along it
+    and its target the origin, that all but the encoder sees: where the finger came down is not told, as in u_t.
     """
     local = poke_frame(points, pokes)
     met = first_met(local, valid)[:, None]
-    shape = layer(params, "shape_1", height_map(local, valid) + wall_map(pokes, arena))
-    shape = layer(params, "shape_2", shape)  # (B, C)
+    shape = layer(params, "shape_2", layer(params, "shape_1", height_map(local, valid) + wall_map(pokes, arena)))
 
     def context(h):  # (B, M, C) -> (B, 3 C)
         return anp.concatenate([max_over_points(h, valid), anp.matmul(met, h)[:, 0], shape], axis=1)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import check_whole
+from . import check_number, check_whole
 from .geometry import project
 from .interactions import cell_centres, cells_of, finger_fits, occupied_grid, with_neighbours
 from .networks import predict
@@ -70,9 +70,10 @@ class Search:
             check_whole(name, getattr(self, name), 1, most)
         if self.elites > self.candidates:
             raise ValueError(f"elites: expected at most {self.candidates}, the candidates, got {self.elites}")
-        weights = self.pixel_weight, self.chamfer_weight
-        if not all(0 <= weight < float("inf") for weight in weights) or not any(weights):
-            raise ValueError(f"pixel_weight, chamfer_weight: expected numbers >= 0, not both 0, got {weights}")
+        for name in ("pixel_weight", "chamfer_weight"):
+            check_number(name, getattr(self, name), least=0)
+        if not self.pixel_weight and not self.chamfer_weight:
+            raise ValueError("pixel_weight, chamfer_weight: expected numbers >= 0, not both 0")
 
 
 class NoPoke(ValueError):

@@ -18,8 +18,7 @@ class Scene:
 
     points (B, N, 3) float32 m, arena. valid (B, N) bool: has depth. occupied (B, N) bool: of an object, Sec. IV-A.
     stands_out (B, N) bool: nearer than the empty arena by more than OCCUPIED, or within RIM of a point that is.
-    images (B, H, W, 3) float32 in [0, 1], N = H W but for marks; None where planning has moved the points.
-    arena: its side in m, between the walls.
+    images (B, H, W, 3) float32 in [0, 1], N = H W but for marks; None where planning moved the points. arena: side, m.
     """
     points: np.ndarray
     valid: np.ndarray
@@ -37,8 +36,7 @@ def scene_of(depth, rgb, empty_depth, camera, arena):
     """Prepare B pictures -> Scene.
 
     Background subtraction, Sec. IV-A: what stands nearer than the empty arena by more than OCCUPIED, inside the walls,
-    is an object's. depth (B, H, W) float m, 0 = missing; rgb (B, H, W, 3) uint8; empty_depth (H, W) m; arena: its side
-    in m.
+    is an object's. depth (B, H, W) float m, 0 = missing; rgb (B, H, W, 3) uint8; empty_depth (H, W) m; arena: side, m.
     """
     points = unproject(depth, camera)
     near = (depth > 0) & (empty_depth > 0) & (empty_depth - depth > OCCUPIED)

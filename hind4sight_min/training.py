@@ -6,15 +6,14 @@ import numpy as np
 from autograd import grad
 from autograd.tracer import getval
 
-from . import check_whole, losses
+from . import check_number, check_whole, losses
 from .geometry import optical_flow
 from .interactions import cell_centres, cells_of
 from .networks import Sizes, init_parameters, inverse_model, predict, state_embedding
 from .ops import at_rows, take, unflatten
 from .scene import Scene, crop, look, most_changed, scene_of
 
-# From an audit of gradient norms, not of the terms' values, which mislead; the photometric one from what turns need.
-# See docs/research-log.md.
+# From an audit of gradient norms, not of the terms' values; the photometric one from what turns need (research log).
 WEIGHTS = {"chamfer": 1e3, "distance_smoothness": 3e2, "photometric": 2.0, "flow_smoothness": 0.01, "inverse": 1.0,
            "binary_masks": 0.5}
 
@@ -42,14 +41,16 @@ class Recipe:
     def __post_init__(self):
         for name, least, most in (("steps", 1, 1e7), ("batch", 1, 4096), ("warmup", 0, 1e7), ("seed", 0, 2 ** 63)):
             check_whole(name, getattr(self, name), least, most)
-        if self.optimiser not in OPTIMISERS:
-            raise ValueError(f"optimiser: expected one of {', '.join(OPTIMISERS)}, got {self.optimiser!r}")
-        if not 0 < self.learning_rate < float("inf"):
-            raise ValueError(f"learning_rate: expected a finite number > 0, got {self.learning_rate}")
-        if not 0 <= self.image_noise < float("inf"):
-            raise ValueError(f"image_noise: expected a finite number >= 0, got {self.image_noise}")
-        if not all(0 <= value < float("inf") for value in self.weights.values()) or not any(self.weights.values()):
-            raise ValueError(f"weights: expected finite numbers >= 0, at least one above 0, got {self.weights}")
+        if self.optimiser not in [*OPTIMISERS]:
+            raise ValueError(f"optimiser: expected one of {', '.join(OPTIMISERS)}, got {str(self.optimiser):.99}")
+        check_number("learning_rate", self.learning_rate, above=0)
+        check_number("image_noise", self.image_noise, least=0)
+        if not isinstance(self.sizes, Sizes):
+            raise ValueError(f"sizes: expected Sizes, got {str(self.sizes):.99}")
+        if not isinstance(self.weights, dict) or not any(self.weights.values()):
+            raise ValueError(f"weights: expected numbers by name, at least one above 0, got {str(self.weights):.99}")
+        for name, value in self.weights.items():
+            check_number(f"weights: {name}", value, least=0)
 
 
 # --- a batch and its loss --------------------------------------------------------------------------------------

@@ -20,6 +20,10 @@ RUNS = {  # benchmark -> what it needs, its arguments, figures that must be amon
                                                                        "roundtrip_flow_mse_ratio_64")),
     "explorer": ((), (), ("explorer_ms", "explorer_ms_max", "explorer_poke_ms")),
     "planning": (("pybullet",), ("--before", ROOT), ("plan_candidates_per_second", "plan_speedup_vs_before")),
+    "scale": (("pybullet",), ("--pokes", "8", "--steps", "1", "--jobs", "1"),
+              ("collect_pokes_per_second", "train_memory_20k_over_2k", "shard_bytes_per_poke")),
+    "kills": (("pybullet",), ("--pokes", "24", "--kills", "2", "1", "1", "1"), ("kills_survived", "kills_writing")),
+    "mutations": ((), ("--files", "20", "--calls", "32"), ("mutated_files_held", "wrong_calls_held")),
     "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1", "--only",
                                                     "ours", "torch_1_threads", "point_cloud_utils", "scipy"),
                    ("chamfer_100_speedup_vs_point", "chamfer_100_speedup_vs_torch_max",
@@ -37,7 +41,8 @@ def test_a_benchmark_runs(name, tmp_path):
     for library in needs:
         pytest.importorskip(library, reason="only installed with the extra 'bench' or 'sim'")
     path = tmp_path / "figures.json"
-    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--rounds", "1", "--json", path, *arguments]
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--json", path, *arguments]
+    command += ["--rounds", "1"] * (name not in ("scale", "kills", "mutations"))
     result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert result.returncode == 0, result.stderr
     assert "does not run here" not in result.stdout, result.stdout + result.stderr

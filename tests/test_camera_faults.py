@@ -100,6 +100,10 @@ def test_noise_is_that_of_sec_iv_b_and_without_faults_nothing_changes():
     noisy, rng = with_faults(data, np.random.default_rng(3), depth_noise=0.01), np.random.default_rng(3)
     np.testing.assert_array_equal(noisy.depth_before, add_depth_noise(data.depth_before, rng))
     np.testing.assert_array_equal(noisy.depth_after, add_depth_noise(data.depth_after, rng))
+    both = with_faults(data, np.random.default_rng(3), depth_noise=0.01, missing=(0.3,))
+    kept = both.depth_after > 0
+    assert 0.5 < kept.mean() < 0.9
+    np.testing.assert_array_equal(both.depth_after[kept], noisy.depth_after[kept], err_msg="what is left is noisy too")
     same = with_faults(data, rng)
     for name in ("depth_before", "depth_after"):
         np.testing.assert_array_equal(getattr(same, name), getattr(data, name))

@@ -177,7 +177,8 @@ def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_
 def test_collect_writes_shards_of_the_size_asked_for_and_figures(tmp_path, capsys):
     assert run("collect", tmp_path / "pokes", "--pokes", 3, "--objects", 1, 2, "--kinds", "cross", "--textures",
                "rings", "--size", 96, 72, "--within", 0.5, "--jobs", 1, "--json", tmp_path / "collect.json") == 0
-    assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["collection.json", "shard_0000.npz", "shard_0000.truth.npz"]
+    assert sorted(path.name for path in (tmp_path / "pokes").iterdir()) == ["collection.json", "shard_0000.npz",
+                                                                            "shard_0000.truth.npz"]
     data, found = load_interactions(tmp_path / "pokes"), json.loads((tmp_path / "collect.json").read_text())
     assert data.rgb_before.shape == (3, 72, 96, 3) and data.settings["kinds"] == ["cross"]
     assert data.settings["place_within"] == 0.5

@@ -164,7 +164,7 @@ BLOCK = np.array([(x, y) for x in (-0.02, -0.01, 0, 0.01, 0.02) for y in (-0.02,
 def test_what_passes_through_something_else(first, second, meets):
     """Two blocks with 2 cm between them, each with its shift."""
     before = np.concatenate([BLOCK, BLOCK + [0.06, 0]])
-    share = control.pass_through(before, before + np.repeat([first, second], 25, axis=0))
+    share = control.pass_through(before, before + np.repeat([first, second], 25, axis=0), 0.015)
     assert share > 0.1 if meets else share == 0
 
 
@@ -176,11 +176,13 @@ def test_care_refuses_plans_that_meet_more_than_they_say_and_those_that_move_wha
     after = view.cloud + np.pad(np.where(first[:, None], shifts[:, :1], shifts[:, 1:]), ((0, 0), (0, 0), (0, 1)))
     clouds = np.stack([after, after + [0, 0.001, 0]], axis=1)  # the second poke does nothing to speak of
 
-    def refused(stays):
-        starts = control.careful(lambda sequences: (clouds, np.zeros((3, 2, 2))), view, stays)(None)[1]
+    def refused(stays, target=(-0.02, 0)):
+        sequences = np.float32([[[*target, 0], [-0.02, 0, 0]]] * 3)
+        starts = control.careful(lambda sequences: (clouds, np.zeros((3, 2, 2))), view, stays)(sequences)[1]
         return np.isnan(starts).all(axis=2).tolist()
-    assert refused(np.zeros(25, bool)) == [[True, False], [False, False], [False, False]]
-    assert refused(np.arange(25) == 3) == [[True, False], [False, False], [True, False]]
+    assert refused(np.zeros(25, bool), target=(0.06, 0)) == [[True, False], [False, False], [False, False]]
+    assert refused(np.arange(25) == 12) == [[True, False], [False, False], [True, False]]
+    assert refused(np.arange(25) == 12, target=(0.06, 0.04)) == [[True, False], [True, False], [True, False]]
 
 
 # --- the closed loop ------------------------------------------------------------------------------------------

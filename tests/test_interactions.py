@@ -6,7 +6,8 @@ import pytest
 from tiny import SETTINGS, camera, tiny_pokes
 
 from hind4sight_min.disk.files import load_npz, save_npz
-from hind4sight_min.disk.shards import DEPTH_UNIT, FORMAT, load_interactions, load_shard, save_shard, shards_in
+from hind4sight_min.disk.shards import (DEPTH_UNIT, FORMAT, load_interactions, load_shard, save_shard, shards_in,
+                                        stamp, stream_interactions)
 from hind4sight_min.interactions import (PER_POKE, cell_centres, cells_of, finger_fits, grid_shape, occupied_grid,
                                          with_neighbours)
 
@@ -38,7 +39,7 @@ def test_a_single_row_is_no_selection():
     *[(name, lambda a: a[:-1], "expected shape") for name in ("rgb_after", "depth_before", "starts")],
     ("rgb_after", lambda a: a.astype(float), "expected uint8"),
     ("depth_before", lambda a: (1e4 * a).astype(np.uint16), "floating-point"),
-    ("pokes", lambda a: a.astype(int), "floating-point"),
+    ("pokes", lambda a: a.astype(complex), "floating-point"), ("rgb_before", lambda a: a.astype(int) - 61, "uint8"),
     *[(name, lambda a, bad=bad: np.where(np.arange(a.shape[-1]) == 0, np.float32(bad), a), "finite")
       for name in ("pokes", "starts", "depth_after", "empty_depth") for bad in (np.nan, np.inf)],
     *[("meta", lambda meta, bad=bad: {"settings": bad}, "settings with a positive")
@@ -121,7 +122,7 @@ def rewrite(path, arrays={}, meta={}, without=()):
 
 @pytest.mark.parametrize("changes, said", [
     ({"meta": {"format": "hind4sight_min interactions 0"}}, "expected format"),
-    ({"meta": {"camera": {**camera().plain, "fx": 0.0}}}, "fx, fy > 0"),
+    ({"meta": {"camera": {**camera().plain, "fx": 0.0}}}, "camera: fx: expected a finite number > 0"),
     ({"arrays": {"starts": np.full((7, 2), np.nan, np.float32)}}, "starts: expected finite"),
     ({"arrays": {"labels": np.zeros(3)}}, "labels"),
     *[({"without": [name]}, name) for name in ("pokes", "empty_depth", "units", "camera", "settings")]])
@@ -144,6 +145,26 @@ def test_a_data_set_is_its_shards_in_order_and_its_truth_is_never_opened(tmp_pat
         parts = [getattr(load_shard(path), name) for path in shards_in(tmp_path)]
         np.testing.assert_array_equal(getattr(joined, name), np.concatenate(parts))
     assert len(joined) == 7
+
+
+def test_pokes_that_stay_on_disk_are_the_same_row_by_row(tmp_path):
+    for index in (0, 1):
+        save_shard(tmp_path / f"shard_{index:04d}.npz", tiny_pokes(count=3 + index, seed=index))
+    whole, streamed = load_interactions(tmp_path), stream_interactions(tmp_path)
+    assert len(streamed) == 7 and stamp(streamed) == stamp(whole)
+    assert not isinstance(streamed.rgb_before, np.ndarray), "in memory after all"
+    for rows in (np.array([6, 0, 3, 3]), np.array([-1, 2]), slice(1, 6, 2), np.arange(7) % 3 == 1, np.array([], int)):
+        for name in PER_POKE:
+            found, expected = getattr(streamed[rows], name), getattr(whole[rows], name)
+            np.testing.assert_array_equal(found, expected, err_msg=f"{name} at {rows}", strict=True)
+    np.testing.assert_array_equal(streamed.depth_after[-2], whole.depth_after[-2], strict=True)
+    for rows in (7, np.array([0, 7])):
+        with pytest.raises(IndexError):
+            streamed.depth_after[rows]
+    streamed.depth_after.file.close()
+    with open("/dev/full", "wb", buffering=0) as streamed.depth_after.file:
+        with pytest.raises(OSError, match="could not be written: No space left on device; TMPDIR"):
+            streamed.depth_after.append(whole.depth_after)
 
 
 @pytest.mark.parametrize("name, other", [

@@ -25,6 +25,8 @@ from hind4sight_min.sim.truth import load_truth, save_truth, truth_path
 from hind4sight_min.training import Recipe, start_run, training_step
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import mutations  # noqa: E402
 
 
 def run(*arguments):
@@ -222,16 +224,18 @@ IMAGE, FLOW = np.ones((B, H, W, 3)), np.ones((B, H, W, 2))
 
 
 @pytest.mark.parametrize("function, arguments, name", [
-    (losses.distance_maps, (CLOUD, CLOUD, MASK * np.uint8(255), MASK), "valid_predicted"),
+    (losses.distance_maps, (CLOUD, CLOUD, MASK * np.uint8(3), MASK), "valid_predicted"),
     (losses.distance_maps, (CLOUD, CLOUD, MASK, MASK.astype(float)), "valid_observed"),
-    (losses.distance_maps, (CLOUD, CLOUD.astype(np.uint16), MASK, MASK), "observed"),
+    (losses.distance_maps, (CLOUD, CLOUD.astype(complex), MASK, MASK), "observed"),
     (losses.distance_maps, (CLOUD, CLOUD, MASK[:1], MASK), "valid_predicted"),
-    (losses.photometric_loss, ((255 * IMAGE).astype(np.uint8), IMAGE, FLOW, MASK), "images"),
-    (losses.photometric_loss, (IMAGE, (255 * IMAGE).astype(np.uint8), FLOW, MASK), "next_images"),
+    (losses.photometric_loss, (IMAGE, (255 * IMAGE).astype(np.uint16), FLOW, MASK), "next_images"),
     (losses.photometric_loss, (IMAGE, IMAGE[:1], FLOW, MASK), "next_images"),
-    (losses.photometric_loss, (IMAGE, IMAGE, FLOW, MASK.astype(int)), "valid"),
+    (losses.photometric_loss, (IMAGE, IMAGE[..., :1], FLOW, MASK), "next_images"),
+    (losses.photometric_loss, (IMAGE, IMAGE, FLOW, MASK[:, 1:]), "valid"),
+    (losses.photometric_loss, ([[1], [1, 2]], IMAGE, FLOW, MASK), "images"),
     (losses.flow_smoothness_loss, (FLOW, IMAGE[:1], MASK), "images"),
-    (losses.flow_smoothness_loss, (FLOW, IMAGE, MASK.astype(np.uint8)), "valid"),
+    (losses.flow_smoothness_loss, (FLOW[..., :1], IMAGE, MASK), "flow"),
+    (losses.flow_smoothness_loss, (FLOW, np.ma.masked_array(IMAGE), MASK), "images"),
     (losses.heatmap_cross_entropy, (np.ones((B, 5)), np.array([0, -1])), "cells"),
     (losses.heatmap_cross_entropy, (np.ones((B, 5)), np.array([5, 0])), "cells"),
     (losses.heatmap_cross_entropy, (np.ones((B, 5)), np.array([1.0, 0])), "cells"),
@@ -240,6 +244,23 @@ IMAGE, FLOW = np.ones((B, H, W, 3)), np.ones((B, H, W, 2))
 def test_the_losses_refuse_what_numpy_would_let_pass(function, arguments, name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
         function(*arguments)
+
+
+RNG = np.random.default_rng(0)
+BYTES, POINTS = RNG.integers(0, 256, IMAGE.shape, np.uint8), RNG.random(CLOUD.shape)
+SEEN = RNG.random(MASK.shape) < 0.7
+
+
+@pytest.mark.parametrize("function, given, meant", [
+    (losses.distance_maps, (POINTS, CLOUD, 255 * np.uint8(SEEN), np.int64(SEEN)), (POINTS, CLOUD, SEEN, SEEN)),
+    (losses.distance_maps, (POINTS.tolist(), np.uint16(CLOUD), SEEN.tolist(), SEEN), (POINTS, CLOUD, SEEN, SEEN)),
+    (losses.photometric_loss, (BYTES, BYTES[::-1], FLOW, SEEN), (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN)),
+    (losses.photometric_loss, ((BYTES / 255).astype(">f8"), (BYTES[::-1] / 255).astype(">f8"), FLOW, SEEN),
+     (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN))], ids=["masks", "lists", "bytes", "byte order"])
+def test_the_losses_convert_what_can_be_converted_exactly(function, given, meant):
+    expected = function(*meant)
+    assert np.max(expected) > 0.01
+    np.testing.assert_allclose(function(*given), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name, spoil, said", [
@@ -360,3 +381,9 @@ def test_a_texture_that_cannot_be_written_is_named(monkeypatch):
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"texture_0\.png: could not be written: No space left on device"):
         arena.Arena(arena.Settings(), np.random.default_rng(0))
+
+
+# --- files and calls by the hundred -------------------------------------------------------------------------------
+
+def test_mutated_files_and_calls_with_wrong_types_hold():
+    assert not mutations.try_cases([*range(11, 5000, 31), *(f"call:{i}" for i in range(3, 1000, 11))])

@@ -24,13 +24,13 @@ FAST = dict(kinds=(), width=32, height=24)
 ALONE = dict(kinds=(), objects_min=1, objects_max=1)
 
 
-def link(name, geometry, mass=0.3, inertia="0 0 0", place="0 0 0", turn="0 0 0", solid=True):
+def link(name, geometry, mass=0.3, inertia="0 0 0", axes="0 0 0", place="0 0 0", turn="0 0 0", solid=True):
     shapes = [f'<{kind}><origin xyz="{place}" rpy="{turn}"/><geometry>{geometry}</geometry>{colour}</{kind}>' for
               kind, colour in (("visual", '<material name="m"><color rgba="0.9 0.1 0.1 1"/></material>'),
                                ("collision", ""))[:1 + solid]]
     return (f'<link name="{name}"><contact><lateral_friction value="0.7"/></contact><inertial>'
-            f'<origin xyz="{inertia}"/><mass value="{mass}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
-            f'</inertial>{"".join(shapes)}</link>')
+            f'<origin xyz="{inertia}" rpy="{axes}"/><mass value="{mass}"/>'
+            f'<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>{"".join(shapes)}</link>')
 
 
 def jointed(kind):
@@ -115,6 +115,16 @@ def test_a_box_from_a_file_stands_in_the_arena_as_it_stands_in_the_file(tmp_path
     np.testing.assert_allclose(np.ptp(top[:, :2], axis=0), [scale * 0.08, scale * 0.06], atol=0.005)
 
 
+def test_it_is_put_down_as_it_stands_in_the_file_just_above_the_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(Arena, "settle", lambda self, limit: True)
+    own = read_urdfs(urdf(tmp_path / "a.urdf", inertia="0.01 0 -0.015", axes="1.5707963 0 0"), 0.8)
+    with Arena(Settings(own=own, width=16, height=12, **ALONE), np.random.default_rng(3)) as arena:
+        arena.new_scene()
+        extent, pose = measure(arena.bullet, arena.bodies[0]), arena.poses()[0]
+    assert extent.height == pytest.approx(0.04, abs=1e-5), "it lies on its side: the axes of its inertia are its own"
+    assert pose[2] - extent.below == pytest.approx(0.001, abs=1e-6) and extent.below == pytest.approx(0.008, abs=1e-5)
+
+
 def test_half_of_the_objects_are_own_where_there_are_kinds_too_and_all_where_there_are_none(tmp_path):
     own = read_urdfs([urdf(tmp_path / f"{i}.urdf", geometry=f'<box size="0.03 0.03 0.0{i}"/>') for i in (2, 3, 4)])
     for kinds, share in ((("can",), 0.5), ((), 1)):
@@ -124,11 +134,15 @@ def test_half_of_the_objects_are_own_where_there_are_kinds_too_and_all_where_the
             for _ in range(10):
                 arena.new_scene()
                 drawn += arena.kinds
-                assert arena.bullet.getNumBodies() == 7 + 6, "what found no room is left"
                 for i, body in enumerate(arena.bodies):
                     assert not any(arena.bullet.getClosestPoints(body, other, 0.002) for other in arena.bodies[:i])
         assert set(drawn) == {*kinds, "2.urdf", "3.urdf", "4.urdf"}
         assert np.mean([name != "can" for name in drawn]) == pytest.approx(share, abs=0.15)
+    settings = Settings(own=own, objects_min=2, objects_max=7, place_within=0.2, **FAST)
+    with Arena(settings, np.random.default_rng(0)) as arena:
+        for _ in range(5):
+            arena.new_scene()
+            assert arena.bullet.getNumBodies() == len(arena.bodies) + 6, "what found no room is left"
 
 
 @dataclass(frozen=True)
@@ -170,9 +184,9 @@ def test_data_sets_know_their_objects_by_content_wherever_the_files_lie(tmp_path
         settings = Settings(own=read_urdfs([tmp_path / folder / "*.urdf"], 0.8), **FAST)
         with parallel_map(1 if folder == "here" else 2) as spread:
             collect(tmp_path / f"from {folder}", 6, 1, settings, spread)
-    shards = [sorted((tmp_path / f"from {folder}").iterdir()) for folder in ("here", "there")]
+    shards = [sorted((tmp_path / f"from {folder}").glob("shard_*")) for folder in ("here", "there")]
     assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]]
-    assert len(shards[0]) == 5  # two shards, their truth, and what the collection is of
+    assert len(shards[0]) == 4
     own = collection.load_shard(shards[0][0]).settings["own"]
     assert [(each["name"], each["scale"]) for each in own] == [("box.urdf", 0.8), ("wedge.urdf", 0.8)]
     assert str(tmp_path) not in json.dumps(own)

@@ -27,7 +27,7 @@ TINY_SCALE = Scale(train_pokes=7, test_pokes=7, steps=3, long_steps=4, seeds=(1,
 def small_world(monkeypatch):
     """Seven pokes of a block in place of simulated ones, and networks of a few units -> the folders asked for."""
     asked = []
-    monkeypatch.setattr(tables, "_data", lambda folder: asked.append(folder.name) or moved_blocks())
+    monkeypatch.setattr(tables, "_data", lambda folder, *_: asked.append(folder.name) or moved_blocks())
     full = tables.recipe_of
     monkeypatch.setattr(tables, "recipe_of", lambda *given: replace(full(*given), sizes=TINY.sizes, batch=4))
     return asked
@@ -222,8 +222,11 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
         first = run_scene(*given)
         assert run_scene(*given) == first
     assert [policy for policy, *_ in asked] == ["learned", "greedy", "learned"]
-    assert (asked[0][1].chamfer_weight, asked[0][1].horizon, asked[2][1].horizon) == (0, 1, 2)
+    assert [search.chamfer_weight for _, search, _ in asked] == [0, 1, 1]
     assert len({tuple(np.random.default_rng(seed).random(3)) for *_, seed in asked}) == 3, "all tries are the same"
+    with monkeypatch.context() as patch, pytest.raises(ValueError, match="made with another"):
+        patch.setattr(control, "GAIN", 0.5)
+        run_scene("pixels", 1, 0)
     checkpoints.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), data))
     with pytest.raises(ValueError, match="made with another"):
         run_scene("pixels", 1, 0)

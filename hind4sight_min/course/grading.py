@@ -23,7 +23,7 @@ import numpy as np
 
 from ..disk.files import read_json, write_json, write_text
 from . import blank, bugs, improve, sandbox
-from .assignments import a8_improve
+from .assignments import a8_improve, assignment_of
 from .task import Answer, judge
 
 MOST_SOURCE, MOST_ZIP, MOST_MEMBERS = 1 << 20, 100 << 20, 2000  # bytes of the file, of a zip unpacked; its files
@@ -114,10 +114,10 @@ def read_zip(path, name):
                 raise ValueError(f"{path.name}: there is no {name} in it")
             with archive.open(found[-1]) as file:
                 content = file.read(MOST_SOURCE + 1)  # what the directory says of its size need not be true
-    except ValueError:
-        raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, a password
-        raise ValueError(f"{path.name}: a damaged or locked zip file ({error})") from None
+        if type(error) is ValueError and str(error).startswith(path.name):
+            raise
+        raise ValueError(f"{path.name}: a damaged or locked zip file ({sandbox.one_line(error)})") from None
     if len(content) > MOST_SOURCE:
         raise ValueError(f"{path.name}: {name} in it has more than {MOST_SOURCE >> 20} MB")
     return as_utf8(content), f"{path}: {found[-1].filename}"
@@ -365,11 +365,11 @@ def finished(path):
 
 def grade_once(name, how, path, content, note):
     """Grade a submission to the assignment `name` unless `path` has its finished results -> the results, the note."""
-    results = None if content is None else finished(path)
+    results, items = None if content is None else finished(path), items_of(assignment_of(name), how)
     if results:
         return results, note
     try:
-        return grade(items_of(assignment_of(name), how), content, path, note=note), note
+        return grade(items, content, path, note=note), note
     except Exception as error:  # ours, as where the sandbox could not begin: not the student's fault
         return read_json(path), f"NOT GRADED: {error}"
 

@@ -4,6 +4,7 @@ from dataclasses import asdict
 import numpy as np
 
 from .. import check_whole
+from ..geometry import Camera
 from ..networks import Sizes, init_parameters
 from ..training import Recipe, Run
 from .files import load_npz, save_npz
@@ -26,9 +27,11 @@ def load_run(path):
     arrays, meta = load_npz(path, FORMAT, MOST_BYTES)
     try:
         check_whole("step", meta["step"], 0)
-        for name, kind in (("log", list), ("sums", dict), ("seconds", float)):
+        for name, kind in (("log", list), ("sums", dict), ("seconds", float), ("settings", dict), ("camera", dict)):
             if not isinstance(meta["run"].get(name, kind()), kind):
                 raise ValueError(f"run: {name}: expected a {kind.__name__}, got {meta['run'][name]!r}")
+        if "camera" in meta["run"]:
+            Camera(**meta["run"]["camera"])
         recipe = Recipe(**{**meta["recipe"], "sizes": Sizes(**meta["recipe"]["sizes"])})
         template = init_parameters(recipe.sizes, np.random.default_rng(0))
         layout, found = {name: value.shape for name, value in template.items()}, meta["layout"]
@@ -38,9 +41,10 @@ def load_run(path):
                                  f"{found.get(name)}")
         size = sum(value.size for value in template.values())
         for name, value in arrays.items():
-            if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"{name}: expected {size} finite numbers, got shape {value.shape}")
+            if value.shape != (size,) or value.dtype != np.float32 or not np.isfinite(value).all():
+                raise ValueError(f"{name}: expected {size} finite float32 numbers, got {value.dtype} of shape "
+                                 f"{value.shape}")
         moments = (arrays.get(name, np.zeros(size, np.float32)) for name in ("first_moment", "second_moment"))
         return Run(recipe, layout, arrays["vector"], *moments, meta["step"], meta["run"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: {str(error)[:300]}") from None

@@ -88,7 +88,7 @@ def clear_away(paths):
 
 @contextmanager
 def only_one(path):
-    """Within the block no other process works on `path`, a file of results: it would overwrite ours.
+    """Within the block no other process works on `path`, a file or a folder of results: it would overwrite ours.
 
     A lock file beside it names our process. That of a dead one is taken over, and what else dead ones left half written
     is removed. Raises ValueError naming the lock file where a process is at it.
@@ -102,13 +102,13 @@ def only_one(path):
                 file.write(this_process())
             break
         except FileExistsError:
-            process = lock.read_text(errors="replace")[:99]
+            process = " ".join(lock.read_text(errors="replace").split())[:99]
             if is_dead(process):
                 lock.unlink(missing_ok=True)
     else:
         raise ValueError(f"{path}: process {process} is at work there; if it is not, remove {lock}")
     try:
-        clear_away(path.parent.glob(f".*.{path.stem}.*"))
+        clear_away([*path.parent.glob(f".*.{path.stem}.*"), *path.glob(".*.*")])
         yield
     finally:
         lock.unlink(missing_ok=True)
@@ -212,11 +212,12 @@ def load_npz(path, format, most=MOST_BYTES):
             check_members(archive.zip, most)
             meta = dict(json.loads(str(archive["meta"])))
             if meta.get("format") != format:
-                raise OtherFormat(f"{path}: expected format {format!r}, got {meta.get('format')!r}")
+                raise OtherFormat(f"{path}: expected format {format!r}, got {meta.get('format')!r:.99}")
             if archive.zip.testzip():  # NumPy reads as far as a header says, and then looks at no checksum
                 raise ValueError("a checksum differs")
             return {name: archive[name] for name in archive.files if name != "meta"}, meta
     except (MemoryError, OtherFormat):
         raise
     except Exception as error:  # damage can surface as almost anything: zlib, zipfile, struct, NumPy, JSON
-        raise ValueError(f"{path}: damaged or not one of our files ({error or type(error).__name__})") from None
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path}: damaged or not one of our files ({reason})") from None

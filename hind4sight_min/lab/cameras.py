@@ -40,6 +40,7 @@ def check_camera(camera, trained=None):
 # --- smaller pictures without distortion --------------------------------------------------------------------------
 
 SEEN = 0.5  # of a block: with depth in less of it a pixel has none
+FLAT = 0.01  # m: what lies nearer to the plane of the table is of it, and two points so near on one surface
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,17 @@ class Sampling:
         return cv2.resize(fine, (width // self.block, height // self.block), interpolation=cv2.INTER_AREA)
 
     def depth(self, picture):
-        """(h, w) m, 0 = missing -> (H, W): the median of every block, of two middle ones the nearer. A mean would lie
-        between the object and the table. Missing where less than SEEN of the block has depth.
+        """(h, w) m, 0 = missing -> (H, W): the median of every block, but of two middle ones that are FLAT apart the
+        nearer, for their mean would lie between object and table. Missing where less than SEEN of it has depth.
         """
         fine, side = cv2.remap(picture, *self.maps, cv2.INTER_NEAREST), self.block
         height, width = np.array(fine.shape) // side
         blocks = fine.reshape(height, side, width, side).swapaxes(1, 2).reshape(height, width, -1)
         seen = (blocks > 0).sum(axis=2)
         ordered = np.sort(np.where(blocks > 0, blocks, np.inf), axis=2)
-        median = np.take_along_axis(ordered, np.maximum(seen - 1, 0)[..., None] // 2, axis=2)[..., 0]
+        near, far = (np.take_along_axis(ordered, np.maximum(middle, 0)[..., None] // 2, axis=2)[..., 0]
+                     for middle in (seen - 1, seen))
+        median = np.where(far < near + FLAT, (near + far) / 2, near)
         return np.where(seen >= SEEN * side ** 2, median, 0).astype(np.float32)
 
 
@@ -108,7 +111,6 @@ def metres_of(name, counts, unit):
 
 # --- the pose -----------------------------------------------------------------------------------------------------
 
-FLAT = 0.01  # m: what lies nearer to the plane of the table is of it
 LEAST_TABLE = 0.25  # of the empty picture's points
 
 
@@ -139,7 +141,7 @@ def fit_plane(points, rng, tries=500):
     away = np.abs(some @ normals.T - np.sum(normals * corners[:, 0], axis=1))
     best = np.where(normals.any(axis=1), (away < FLAT).sum(axis=0), 0).argmax()
     normal, middle = normals[best], corners[best, 0]
-    for _ in range(5):
+    for _ in range(50):  # until nothing changes: after 5 it still depends on the draws
         inside = np.abs((points - middle) @ normal) < FLAT
         middle = points[inside].mean(axis=0)
         normal = np.linalg.eigh(np.cov(points[inside].T))[1][:, 0]

@@ -15,7 +15,7 @@ from .. import __version__, planning, training
 from ..disk import checkpoints
 from ..disk.files import check_output, only_one, shipped, write_json
 from ..disk.recordings import save_recording
-from ..disk.shards import load_interactions, parts_of
+from ..disk.shards import load_interactions, parts_of, stream_interactions
 from ..networks import Sizes
 from ..sim.arena import MIDDLE, Settings
 from ..sim.bodies import read_urdfs
@@ -170,7 +170,7 @@ def run_train(args):
     from . import figures
     out = Path(args.out)
     check_output("out", out, ".npz")  # a folder of pokes without a checkpoint after it has another ending
-    interactions = load_interactions(args.data)
+    interactions = stream_interactions(args.data)
     given = {name: value for name, value in vars(args).items() if value is not None and name not in (
         "command", "function", "data", "out", "jobs", "json", "resume")}
     if args.resume and given:
@@ -433,7 +433,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         **OWN,
         "--textures": {"nargs": "+", "default": Settings.textures, "help": f"of {', '.join(TEXTURES)}"},
         "--part": {"type": part_of, "metavar": "I/N", "default": (1, 1),
-                   "help": "the I-th of N that share the work, at once or not; without it, what is missing (default all)"},
+                   "help": "the I-th of N that share the work; without it, all that is missing (default)"},
         "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
     "import": (run_import, "make a folder of shards from a real camera's recording: see docs/own-data.md", {
         "folder": {"help": "of the recording: camera.json, pokes.csv and PNG pictures"},
@@ -466,7 +466,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
         "checkpoint": SHIPPED,
         "data": {"nargs": "?", "help": "a folder of pokes to explore, in place of the simulator"},
         "--seed": {**SEED, "help": "which scene"},
-        "--mine": {"nargs": "+", "default": (), "metavar": "FOLDER", "help": "take what a student wrote there in "
+        "--mine": {"nargs": "+", "metavar": "FOLDER", "help": "take what a student wrote there in "
                    "place of the reference's functions; their code runs with all your rights"},
         "--script": {"metavar": "FILE", "help": "no window: do what the file says (docs/explorer.md)"},
         "--demo": {"metavar": "OUT.gif", "help": "no window: film the script, or one of our own"},

@@ -30,9 +30,10 @@ IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 NEAR = 2.0  # cost below which places are right and turns are left, about
 GAIN = 0.01  # of the cost; a poke that is predicted to bring less is not worth its risk
-CLEAR = 0.015  # m; what passes nearer by something else than this pushes it
-PASSES = 0.05  # share of the points that move; what is predicted to pass through something else may be so large
-STAYS = 0.005  # m; a mark that shall stay may be predicted to move so far
+CLEAR = 0.015, 0.02  # m; what passes nearer by something else pushes it; the second where a mark shall stay
+PASSES = 0.05, 0.03  # share of the points that move that may be predicted to do so
+STAYS = 0.002  # m; a mark that shall stay may be predicted to move so far
+KEEP_OFF = 0.05  # m; no nearer to it may the finger's target be
 TURN = np.pi / 4  # rad; goals are turned by at most this
 POLICIES = ("learned", "oracle", "no_motion", "random", "greedy")
 
@@ -195,32 +196,34 @@ def careful(rollout, view, stays):
     """A rollout without the plans that would push more than they say: their starts are NaN. Not in the paper.
 
     The model sees what the finger meets, less well what that meets in turn. So hardly anything may be predicted to
-    `pass_through` something else, and no mark that stays, (M,) bool, to move by more than STAYS.
+    `pass_through` something else, and no mark that stays, (M,) bool, to move by more than STAYS; nor is what it marks
+    poked, for small pokes are foreseen worst.
     """
     def checked(sequences):
         clouds, starts = rollout(sequences)
+        clear, passes = CLEAR[any(stays)], PASSES[any(stays)]
         before = np.concatenate([np.repeat(view.cloud[None, None], len(clouds), axis=0), clouds[:, :-1]], axis=1)
         marks = np.flatnonzero(stays) + len(view.cloud) - view.marked
-        refused = (np.linalg.norm((clouds - before)[:, :, marks], axis=3) > STAYS).any(axis=2)
+        near = np.linalg.norm(sequences[:, :, None, :2] - view.cloud[marks, :2], axis=3) < KEEP_OFF
+        refused = (near | (np.linalg.norm((clouds - before)[:, :, marks], axis=3) > STAYS)).any(axis=2)
         for which in np.argwhere(~refused):
             here, there = (each[tuple(which)][view.occupied, :2] for each in (before, clouds))
-            refused[tuple(which)] = pass_through(here, there) > PASSES
+            refused[tuple(which)] = pass_through(here, there, clear) > passes
         return clouds, np.where(refused[..., None], np.nan, starts)
     return checked
 
 
-def pass_through(before, after):
-    """Of the points that move: the share that on its way meets a point that goes less than half as far -> a number.
-
-    before, after (n, 2) m, on the plane of the arena.
+def pass_through(before, after, clear):
+    """Of the points that move: the share that on its way comes nearer than `clear` m to the place of a point that goes
+    less than half as far. before, after (n, 2) m, on the plane of the arena -> a number.
     """
     length = np.linalg.norm(after - before, axis=1)
-    moves = length > CLEAR
+    moves = length > clear
     if not moves.any():
         return 0.0
     way = [before[moves] + part * (after - before)[moves] for part in (1 / 3, 2 / 3, 1)]
     distance, nearest = cKDTree(before).query(np.stack(way))
-    return np.mean((distance < CLEAR) & (length[nearest] < length[moves] / 2))
+    return np.mean((distance < clear) & (length[nearest] < length[moves] / 2))
 
 
 def greedy_poke(view, goal, camera, settings, rng):

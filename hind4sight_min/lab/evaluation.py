@@ -38,7 +38,8 @@ class Answer:
 def ask(run, interactions, row, **faults):
     """The whole model on one row of a data set -> Answer. faults: of the camera that it sees the row with, as those of
     `camera_faults.with_faults`: the same at every call, others for every row. Pictures with faults, and all that a run
-    for real cameras is asked about, are `prepared` first. Raises ValueError for a camera that cannot show the run its arena.
+    for real cameras is asked about, are `prepared` first. Raises ValueError for a camera that cannot show the run its
+    arena.
     """
     check_camera(interactions.camera, Camera(**run.meta["camera"]))
     one = interactions[[row]]

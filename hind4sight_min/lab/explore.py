@@ -32,7 +32,7 @@ from .worlds import world_of
 
 KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goals  [g]", "p": "plan  [p]",
         "s": "save  [s]"}
-SIZE = 13.0, 7.8  # inches
+SIZE = 12.4, 7.1  # inches: fits a small laptop
 SAME = 0.03  # m; a mark takes the place of one so near
 
 
@@ -320,7 +320,7 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
     minds the mouse. Raises RuntimeError where it can do neither.
     """
     run = load_run(checkpoint or data_small() / "checkpoint.npz")
-    yours = [name for folder in mine for name in take_written(folder)]
+    yours = [name for folder in mine or () for name in take_written(folder)]
     if figure is None:
         import matplotlib.pyplot as plt
         with rc_context({"toolbar": "None"}):

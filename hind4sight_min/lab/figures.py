@@ -395,7 +395,7 @@ def explorer_panels(figure, camera, settings, buttons):
         rings=view.plot([], [], "o", color=GOAL, markersize=11, fillstyle="none", markeredgewidth=2,
                         path_effects=OUTLINE)[0],
         stars=view.plot([], [], "*", color=GOAL, markersize=13, markeredgecolor="black")[0],
-        text=figure.text(0.012, 0.068, "", fontsize=10.5),
+        text=view.text(0.012, 0.068, "", fontsize=10.5, transform=figure.transFigure),
         buttons={key: figure.text(0.02 + 0.125 * i, 0.022, text, bbox={"boxstyle": "round", "facecolor": BLANK,
                                                                        "edgecolor": "0.5"})
                  for i, (key, text) in enumerate(buttons.items())})

@@ -4,13 +4,15 @@ points"; how they are found again is not in the paper.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from .. import as_arrays
+
 
 def points_at(pixels, scene, camera):
     """The points (M, 3) m, arena, of a Scene of one picture that the user marked at pixels (M, 2), (x right, y down).
 
     Raises ValueError for a mark outside the picture or on the background.
     """
-    pixels = np.asarray(pixels, float)
+    pixels, = as_arrays("*", marks=pixels)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or not len(pixels):
         raise ValueError(f"marks: expected (M, 2) pixels, at least one, got shape {pixels.shape}")
     found = []
@@ -37,7 +39,7 @@ def places_at(pixels, heights, camera, settings):
 
     Raises ValueError where that is outside the picture or the walls: a goal there cannot be met.
     """
-    pixels = np.asarray(pixels, float)
+    pixels, = as_arrays("*", goals=pixels)
     if pixels.shape != (len(heights), 2) or not np.isfinite(pixels).all():
         raise ValueError(f"goals: expected ({len(heights)}, 2) finite pixels, one per mark, got shape {pixels.shape}")
     places = at_height(pixels, heights, camera)

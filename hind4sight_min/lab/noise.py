@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from .. import as_arrays, check_number
 from ..disk.shards import DEPTH_UNIT
 from ..training import unsupervised
 
@@ -17,6 +18,8 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing. Every pixel of every picture has
     noise of its own.
     """
+    depth, = as_arrays("*HW", depth=depth)
+    check_number("standard_deviation", standard_deviation)
     if not 0 <= standard_deviation <= 10:
         raise ValueError(f"standard_deviation: expected 0 to 10 m, got {standard_deviation}")
     valid = depth > 0

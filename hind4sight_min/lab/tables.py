@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 from .. import planning, training
 from ..disk import checkpoints
 from ..disk.files import plain, read_json, write_json
-from ..disk.shards import load_interactions
+from ..disk.shards import load_interactions, stream_interactions
 from ..sim.arena import MIDDLE, Settings
 from ..sim.collection import collect
 from ..sim.objects import HELD_OUT
@@ -27,7 +27,9 @@ from .runs import train_saving
 
 @dataclass(frozen=True)
 class Scale:
-    """train_pokes, test_pokes: how many (of each of TESTS, times its factor). steps: of every cell of the tables; long_steps: of the headline models."""
+    """train_pokes, test_pokes: how many, of each of TESTS times its factor. steps: of every cell of the tables;
+    long_steps: of the headline models.
+    """
     train_pokes: int = 48000
     test_pokes: int = 1000
     steps: int = 3000
@@ -136,8 +138,8 @@ def collect_data(out, scale, map=map, progress=None):
 
 
 @lru_cache(maxsize=2)
-def _data(folder):
-    return se3nets.Supervised(load_interactions(folder), load_truth(folder))
+def _data(folder, read=load_interactions):
+    return se3nets.Supervised(read(folder), load_truth(folder))
 
 
 # --- one cell ----------------------------------------------------------------------------------------------------
@@ -190,7 +192,7 @@ def run_cell(cell, out, scale, save_every=60.0):
     window = MODELS[cell.model][2]
 
     def compute():
-        data = _data(out / "train")
+        data = _data(out / "train", stream_interactions)
         run = checkpoints.load_run(path) if path.exists() else training.start_run(recipe, data.interactions)
         if run.recipe != recipe:
             raise ValueError(f"{path}: made with another recipe; remove it, or choose another --out")
@@ -239,7 +241,8 @@ def summarise(results, scale):
             figures[f"{group}_{metric}"] = float(np.mean(values))
             figures[f"{group}_{metric}_sd"] = float(np.std(values, ddof=1))
     for (worse, better), noise in product(ORDER, NOISES):
-        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])] for model in (worse, better)]
+        ours = [[metrics["flow_mse_ratio"] for metrics in groups.get(f"{model}_{noise}", [])]
+                for model in (worse, better)]
         if all(ours):
             less, name = np.subtract(*ours), f"{worse}_less_{better}_{noise}"
             figures[name] = float(less.mean())
@@ -276,7 +279,7 @@ def flow_table(figures, name):
 
 def order_table(figures):
     """How sure the order of the ablation is: differences within a seed, ours with their interval, and the paper's."""
-    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval over seeds")]
+    rows = [("difference of flow MSE / no motion", "noise", "paper", "the paper's SDs", "ours, 95 % interval")]
     for (worse, better), (i, noise) in product(ORDER, enumerate(NOISES)):
         name, paper = f"{worse}_less_{better}_{noise}", MODELS[worse][3][i] - MODELS[better][3][i]
         if name in figures:
@@ -334,7 +337,8 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
 
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
-        "settings": control.settings_for(run).plain}), compute)
+        "settings": control.settings_for(run).plain,
+        "loop": [control.GAIN, control.NEAR, control.CLEAR, control.PASSES, control.STAYS, control.KEEP_OFF]}), compute)
 
 
 def outcome(record):

@@ -76,7 +76,14 @@ class Recorded:
     is played is the recorded one. rows: of the scene's pokes that are still to be played.
     """
     demo = """
+        drag 17 36 26 38 26 33 20 29 26 33
         wait 1
+        key space
+        wait 3
+        goal 17 36 28 30
+        wait 1
+        key p
+        wait 3
     """
 
     def __init__(self, interactions, truth, seed):

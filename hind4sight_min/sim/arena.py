@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .. import check_whole
+from .. import check_number, check_whole
 from ..disk.files import plain, whole_file
 from ..geometry import Camera
 from ..interactions import cell_centres, finger_fits, occupied_grid
@@ -23,6 +23,11 @@ SUPERSAMPLE = 3  # odd: the middle sample of a block of rays lies on the pixel's
 NEAR, FAR = 0.2, 2.0  # m from the camera; the renderer sees what lies between
 TOPPLING = 720  # steps that a scene of own objects has to come to rest in: they may fall over
 PARK_HEIGHT = 1.0  # m; the finger waits up here, out of the camera's sight
+
+
+def some_of(names, known):
+    """Whether these are one or more of those that are known."""
+    return isinstance(names, (tuple, list)) and bool(names) and all(name in [*known] for name in names)
 
 
 @dataclass(frozen=True)
@@ -55,16 +60,16 @@ class Settings:
         for name, kind, value in [(field.name, field.type, getattr(self, field.name)) for field in fields(self)]:
             if kind is int:
                 check_whole(name, value, 1)
-            elif kind is float and not 0 < value < float("inf"):
-                raise ValueError(f"{name}: expected a finite number > 0, got {value}")
+            elif kind is float:
+                check_number(name, value, above=0)
         cells, length = self.arena / self.cell, self.poke_length
         paths = isinstance(length, tuple) and len(length) == 2 and 0 < length[0] < length[1] < self.arena
         own = isinstance(self.own, tuple) and all(hasattr(each, "add") and hasattr(each, "plain") for each in self.own)
         for good, name, expected in (
                 (self.objects_min <= self.objects_max <= MAX_OBJECTS, "objects_max", f"objects_min to {MAX_OBJECTS}"),
-                ((self.kinds or self.own) and set(self.kinds) <= set(KINDS), "kinds", f"some of {', '.join(KINDS)}"),
+                (some_of(self.kinds, KINDS) or self.own and not self.kinds, "kinds", f"some of {', '.join(KINDS)}"),
                 (own, "own", "a tuple of what read_urdfs makes, or of other objects that have add and plain"),
-                (self.textures and set(self.textures) <= set(TEXTURES), "textures", f"some of {', '.join(TEXTURES)}"),
+                (some_of(self.textures, TEXTURES), "textures", f"some of {', '.join(TEXTURES)}"),
                 (self.arena <= 0.5, "arena", "at most 0.5 m, which the camera sees"),
                 (abs(cells - round(cells)) < 1e-6, "cell", "one that the arena has a whole number of"),
                 (self.place_within <= 1, "place_within", "a share of the arena, at most 1"),

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .. import as_arrays
 from ..disk.files import load_npz, save_npz
 from ..disk.shards import FORMAT, check_same_data, load_shard, shards_in, stamp
 
@@ -17,16 +18,26 @@ class Truth:
 
     labels: (M, H, W) uint8 before the poke, 0 = background, i + 1 = object i.
     poses_before, poses_after: (M, 7, 7) float32, arena, per object (x, y, z, qx, qy, qz, qw); unused rows 0.
-    Raises ValueError for poses that are not finite.
+    Raises ValueError for other shapes, labels beyond 7, and poses that are none.
     """
     labels: np.ndarray
     poses_before: np.ndarray
     poses_after: np.ndarray
 
     def __post_init__(self):
+        self.labels, = as_arrays("MHW", labels=self.labels)
+        if not (0 <= self.labels.min(initial=0) and self.labels.max(initial=0) <= 7):
+            raise ValueError(f"labels: expected 0 to 7, got {self.labels.min()} to {self.labels.max()}")
+        used = np.arange(7) < self.labels.max(axis=(1, 2), initial=0)[:, None]
         for name in ("poses_before", "poses_after"):
-            if not np.isfinite(getattr(self, name)).all():
+            poses, = as_arrays("*", **{name: getattr(self, name)})
+            setattr(self, name, poses)
+            if poses.shape != (len(self.labels), 7, 7):
+                raise ValueError(f"{name}: expected shape {(len(self.labels), 7, 7)}, got {poses.shape}")
+            if not np.isfinite(poses).all():
                 raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+            if not (np.linalg.norm(poses[used][:, 3:], axis=1) > 0).all():
+                raise ValueError(f"{name}: expected a quaternion for every object, got one that is 0")
 
     def __getitem__(self, rows):
         return Truth(self.labels[rows], self.poses_before[rows], self.poses_after[rows])
