@@ -16,8 +16,7 @@ import time
 from pathlib import Path
 
 from hind4sight_min.disk.files import write_json
-from hind4sight_min.disk.shards import shards_in
-from hind4sight_min.sim.collection import SHARD_POKES
+from hind4sight_min.disk.shards import SHARD_POKES, shards_in
 from hind4sight_min.sim.truth import truth_path
 
 ROOT = Path(__file__).resolve().parent.parent

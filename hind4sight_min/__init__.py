@@ -34,30 +34,33 @@ def check_whole(name, value, least, most=float("inf")):
         raise ValueError(f"{name}: expected a whole number >= {least}{limit}, got {str(value):.99}")
 
 
-def check_number(name, value, least=-float("inf"), above=-float("inf")):
-    """Raise a ValueError that says what is wrong unless `value` is a finite number, from `least` on and above `above`.
+def check_number(name, value, least=-float("inf"), most=float("inf"), above=-float("inf")):
+    """Raise a ValueError that says what is wrong unless `value` is a finite number, from `least` to `most` and above
+    `above`.
     """
-    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not (number and least <= value < float("inf") and above < value):
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool) and abs(value) < float("inf")
+    if not (number and least <= value <= most and above < value):
         limit = f" > {above}" if above > least else f" >= {least}" if least > -float("inf") else ""
+        limit += f" and <= {most}" if most < float("inf") else ""
         raise ValueError(f"{name}: expected a finite number{limit}, got {str(value):.99}")
 
 
-KINDS = (("valid", "b", "bool"), ("cells", "iu", "whole numbers"), ("labels", "iu", "whole numbers"),
+# part of an array's name, kinds of dtype as NumPy abbreviates them, in words; the first part that the name has decides
+TYPES = (("valid", "b", "bool"), ("cells", "iu", "whole numbers"), ("labels", "iu", "whole numbers"),
          ("rgb", "u", "uint8"), ("depth", "f", "floating-point metres"), ("", "f", "floating-point numbers"))
 
 
 def as_arrays(patterns, **arrays):
-    """The arrays of a call, in order, as their names say that they are wanted; converted where that is exact -> list.
+    """Check a call's arrays by their names and shapes, and convert them where that is exact -> list, in their order.
 
+    flow, valid = as_arrays("BHW2 BP", flow=flow, valid=valid): patterns has a shape for each array, as `fits` reads it.
     `valid` is bool (0 and 1, or 0 and 255, become it), `cells` and `labels` whole numbers, `rgb` uint8, `depth`
     floating-point metres, all else floating-point numbers (whole ones become it, bytes of `images` in [0, 1]).
-    patterns: of their shapes, as of `fits`, with blanks between.
     Raises a ValueError naming the array that is none of these or has another shape: NumPy would let it pass.
     """
     found, sizes = [], {}
     for (name, value), pattern in zip(arrays.items(), patterns.split(), strict=True):
-        _, kinds, expected = next(each for each in KINDS if each[0] in name)
+        _, kinds, expected = next(each for each in TYPES if each[0] in name)
         try:
             array = value if hasattr(value, "dtype") else np.asarray(value)  # a box of autograd's stays one
         except ValueError:  # rows of several lengths

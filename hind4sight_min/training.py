@@ -41,7 +41,7 @@ class Recipe:
     def __post_init__(self):
         for name, least, most in (("steps", 1, 1e7), ("batch", 1, 4096), ("warmup", 0, 1e7), ("seed", 0, 2 ** 63)):
             check_whole(name, getattr(self, name), least, most)
-        if self.optimiser not in [*OPTIMISERS]:
+        if self.optimiser not in [*OPTIMISERS]:  # a list, for what cannot be hashed
             raise ValueError(f"optimiser: expected one of {', '.join(OPTIMISERS)}, got {str(self.optimiser):.99}")
         check_number("learning_rate", self.learning_rate, above=0)
         check_number("image_noise", self.image_noise, least=0)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiny import camera, random_run, tiny_pokes
 
 from hind4sight_min.disk import checkpoints, recordings
-from hind4sight_min.disk.shards import counts_of, load_interactions, save_shard, stamp
+from hind4sight_min.disk.shards import counts_of, load_interactions, save_shard
 from hind4sight_min.geometry import unproject
 from hind4sight_min.interactions import PER_POKE
 from hind4sight_min.lab import cameras, control, evaluation

@@ -101,7 +101,8 @@ def test_cells_of_other_settings_or_another_network_are_neither_kept_nor_restore
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/architecture.md", "docs/not-in-the-paper.md",
-                                  "docs/extending.md", "docs/explorer.md", "docs/speed.md", "docs/understanding.md"])
+                                  "docs/extending.md", "docs/explorer.md", "docs/speed.md", "docs/understanding.md",
+                                  "docs/own-data.md", "docs/many-machines.md", "docs/teaching.md"])
 def test_a_page_points_to_functions_and_files_that_exist(page):
     text = (ROOT / page).read_text()
     for words in re.findall(r"`((?:[a-z_0-9]+\.)+[A-Za-z_]+)`", text):

@@ -42,9 +42,11 @@ def dead_process():
 
 # --- files that could not be written ------------------------------------------------------------------------------
 
+def full(*_, **__):
+    raise OSError(28, "No space left on device")
+
+
 def test_a_file_that_cannot_be_written_is_named(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
     monkeypatch.setattr(files.np, "savez_compressed", full)
     with pytest.raises(OSError, match=r"model\.npz: could not be written: No space left on device"):
         files.save_npz(tmp_path / "model.npz", {}, {})
@@ -375,9 +377,6 @@ def test_training_leaves_a_checkpoint_alone_that_another_process_works_on(tmp_pa
 
 def test_a_texture_that_cannot_be_written_is_named(monkeypatch):
     pytest.importorskip("pybullet")
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match=r"texture_0\.png: could not be written: No space left on device"):
         arena.Arena(arena.Settings(), np.random.default_rng(0))

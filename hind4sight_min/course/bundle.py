@@ -9,8 +9,7 @@ from importlib.metadata import requires
 from pathlib import Path
 
 from .. import __version__
-from ..disk.files import whole_file
-from ..lab.cli import data_small
+from ..disk.files import data_small, whole_file
 from .bugs import PACKAGE
 
 NOT_NEEDED = ("pybullet",)  # to simulate; students leave `import matplotlib` in

@@ -253,10 +253,11 @@ def put_in_place(path, test_module, monkeypatch):
 
 
 def take_written(folder, replace=setattr):
-    """The same, for good, with the functions that a student has written in a folder of exercises -> their names.
+    """Replace the reference's functions by those that a student has written in a folder of exercises -> their names.
 
-    What still raises its NotImplementedError stays the reference's. This is a plain import: the code runs with all your
-    rights, not apart as in `grade`. Raises ValueError for a folder without an exercise, and what its files raise.
+    For good, if `replace` is setattr. What still raises its NotImplementedError stays the reference's. This is a plain
+    import: the code runs with all your rights, not apart as in `grade`. Raises ValueError for a folder without an
+    exercise, and what its files raise.
     """
     carved = {f"{each.name}.py": each for each in ASSIGNMENTS if each.tasks}
     paths, taken = [path for path in sorted(Path(folder).glob("*.py")) if path.name in carved], []

@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..disk.files import data_small
 from ..disk.shards import load_interactions
 from ..interactions import PER_POKE
-from ..lab.cli import data_small
 from ..lab.evaluation import ratio_of, scenes_of_pokes, true_motion
 from ..sim.truth import load_truth
 from .assignments.a8_improve import BASELINE, MINUTES, TARGET

@@ -23,10 +23,15 @@ def shipped(path):
     return next((place for place in places if place.exists()), places[0])
 
 
+def data_small():
+    """The folder of the shipped data."""
+    return shipped("data_small")
+
+
 @contextmanager
 def whole_file(path, new=False):
-    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not. new: or
-    when there is such a file already, be it by another process meanwhile.
+    """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not. new: a
+    file that is there already stays, be it that another process made it meanwhile.
 
     Raises OSError naming `path` where it cannot be written, be it only that the disk is full.
     """
@@ -79,7 +84,7 @@ def is_dead(process):
 
 
 def clear_away(paths):
-    """Remove what dead processes of this machine left half written: of `paths`, those that `whole_file` calls so."""
+    """Of `paths`, remove the temporary files of `whole_file` that dead processes of this machine have left."""
     for path in paths:
         left = re.match(rf"\.(\d+@{re.escape(socket.gethostname())})\.", path.name)
         if left and is_dead(left[1]):

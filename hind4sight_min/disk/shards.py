@@ -15,6 +15,7 @@ from ..interactions import MOST_DEPTH, PER_POKE, Interactions
 from .files import load_npz, plain, save_npz
 
 FORMAT = "hind4sight_min interactions 1"
+SHARD_POKES = 100  # a simulated shard is one world, so that the data do not depend on who collects it
 DEPTH_UNIT = 1e-4  # m per count of the stored uint16 depth: 0.1 mm, up to 6.5 m
 
 
@@ -76,7 +77,7 @@ def find_shards(folder):
 
 
 def shards_in(folder):
-    """The same; raises ValueError if there is none."""
+    """The shards of a data set, as `find_shards`. Raises ValueError if there is none."""
     shards = find_shards(folder)
     if not shards:
         raise ValueError(f"{folder}: no shard_*.npz there; 'hind4sight collect' makes them")

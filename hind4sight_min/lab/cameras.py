@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..disk.recordings import EMPTY, load_recording
-from ..disk.shards import find_shards, save_shard
+from ..disk.shards import SHARD_POKES, find_shards, save_shard
 from ..geometry import Camera, project, unproject
 from ..interactions import MOST_DEPTH, Interactions
 from ..scene import look, scene_of
@@ -187,9 +187,6 @@ def filled(empty_depth, camera):
 
 
 # --- the import ---------------------------------------------------------------------------------------------------
-
-SHARD_POKES = 100
-
 
 def camera_of(recording, sampling, empty_depth):
     """The Camera of the smaller pictures, with the pose as recorded or as the small empty picture (H, W) m shows it,

@@ -1,6 +1,5 @@
 """The `hind4sight` command: collect, import, train, evaluate, show, explore, plan, demo and more; `COMMAND --help`."""
 import argparse
-import json
 import os
 import sys
 import time
@@ -13,7 +12,7 @@ import numpy as np
 
 from .. import __version__, planning, training
 from ..disk import checkpoints
-from ..disk.files import check_output, only_one, shipped, write_json
+from ..disk.files import check_output, data_small, only_one, read_json, write_json
 from ..disk.recordings import save_recording
 from ..disk.shards import load_interactions, parts_of, stream_interactions
 from ..networks import Sizes
@@ -30,11 +29,6 @@ from .processes import parallel_map
 from .runs import total, train_saving
 
 # `figures` is imported where a picture is made: Matplotlib takes a third of a second, in every worker process too.
-
-
-def data_small():
-    """The folder of the shipped data."""
-    return shipped("data_small")
 
 
 # --- what is printed -------------------------------------------------------------------------------------
@@ -204,8 +198,8 @@ def run_train(args):
 
 
 def folder_alone(args):
-    """`evaluate FOLDER` means the shipped checkpoint on that data."""
-    if Path(args.checkpoint).is_dir() and args.data == TEST["default"]:
+    """`evaluate FOLDER` means the shipped checkpoint on that data; `show` and `explore` too."""
+    if Path(args.checkpoint).is_dir() and args.data in (None, TEST["default"]):
         args.checkpoint, args.data = SHIPPED["default"], args.checkpoint
 
 
@@ -246,6 +240,7 @@ def run_show(args):
 
 def run_explore(args):
     from .explore import run_explore
+    folder_alone(args)
     run_explore(args)
 
 
@@ -333,12 +328,12 @@ def run_demo(args):
     run("Train on them without labels: Chamfer, photometric, smoothness and inverse losses (Eq. 6).",
         "train", train, model, "--steps", DEMO_STEPS, "--learning-rate", 0.002, "--seed", args.seed, *jobs)
     run("Evaluate on pokes that were never trained on.", "evaluate", model, test, "--json", found)
-    metrics = json.loads(found.read_text())
+    metrics = read_json(found)
     run("Look at one of them.", "show", model, test, "--out", out / "interaction.png")
     if simulating:
         run("Plan pokes to a goal with the model (CEM), carry them out, look again; in a scene of neither pokes.",
             "plan", model, "--seed", args.seed + 2, "--budget", 6, "--out", out, "--json", found)
-        metrics.update(json.loads(found.read_text()))
+        metrics.update(read_json(found))
     metrics["seconds"] = time.perf_counter() - began
     print(f"The whole demo took {metrics['seconds']:.0f} s.")
     write_json(args.json or found, {f"demo_{name}": value for name, value in metrics.items()})

@@ -9,8 +9,9 @@ from functools import partial
 import numpy as np
 
 from .. import check_whole
+from ..disk.shards import SHARD_POKES
 from ..sim.arena import MIDDLE, Arena, Settings
-from ..sim.collection import SHARD_POKES, collect_shard
+from ..sim.collection import collect_shard
 from .control import settings_for
 from .evaluation import errors_of_poke, ratio_of, scenes_of_pokes, true_motion
 from .tables import CROWDED, table

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ..course.carve import take_written
 from ..course.task import described
 from ..disk.checkpoints import load_run
-from ..disk.files import check_output
+from ..disk.files import check_output, data_small
 from ..geometry import Camera, optical_flow, project, rigid
 from ..interactions import occupied_grid
 from ..losses import chamfer_loss, distance_maps, seen_in_both
@@ -24,11 +24,9 @@ from ..planning import Search, first_start, goal_of, learned_step, plan, possibl
 from ..scene import scene_of
 from . import figures
 from .cameras import check_camera
-from .cli import data_small
 from .evaluation import MOVING
 from .marks import at_height, follow, places_at, points_at
 from .worlds import world_of
-
 
 KEYS = {" ": "poke!  [space]", "n": "next scene  [n]", "u": "undo  [u]", "g": "goals  [g]", "p": "plan  [p]",
         "s": "save  [s]"}
@@ -42,7 +40,7 @@ class Explorer:
 
     poke (3,), prediction, flow (H, W, 2) px: what is drawn. scene, view: what the camera sees now, without and with
     marked points; goals (M, 2) px: where these shall go. error: of the last poke carried out, cm. frames: a list to
-    film on, or None. Raises ValueError for a checkpoint of another camera.
+    film on, or None. Raises ValueError for a camera that cannot show the run its arena.
     """
 
     def __init__(self, figure, world, run, out=".", yours=()):
@@ -332,8 +330,6 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
 
 def run_explore(args):
     """`hind4sight explore`."""
-    if Path(args.checkpoint).is_dir() and args.data is None:  # as for `evaluate`
-        args.checkpoint, args.data = None, args.checkpoint
     given = args.checkpoint, args.data, args.seed, args.mine, args.out
     if not args.script and not args.demo:
         import matplotlib.pyplot as plt

@@ -4,7 +4,6 @@ is not used.
 Image panels show pixels as they are, (0, 0) top left. Arena panels are seen from above, in metres: x to the right, y
 up, so that the camera looks in from the lower edge. A panel's Axes carry their name as label.
 """
-from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
 from matplotlib.patheffects import Normal, withStroke
 
+from .. import check_number
 from ..disk.files import check_output, whole_file
 from ..geometry import project
 from ..interactions import grid_shape
@@ -46,8 +46,7 @@ def flow_to_rgb(flow, scale):
     """
     if flow.ndim != 3 or flow.shape[2] != 2 or not np.isfinite(flow).all():
         raise ValueError(f"flow: expected finite pixels (H, W, 2), got shape {flow.shape}, or NaN or infinity")
-    if not 0 < scale < np.inf:
-        raise ValueError(f"scale: expected a finite number of pixels > 0, got {scale}")
+    check_number("scale", scale, above=0)
     hue = np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi)
     full = np.clip(np.abs((6 * hue[..., None] + [0, 4, 2]) % 6 - 3) - 1, 0, 1)
     saturation = np.minimum(np.linalg.norm(flow, axis=-1) / scale, 1)
@@ -508,8 +507,7 @@ def save_figure(figure, path):
     Not in the paper. The figure's layout stays as saved: a second pass would move panels by a hair.
     Raises ValueError for a path that does not end in .png.
     """
-    if Path(path).suffix.lower() != ".png":
-        raise ValueError(f"path: expected a name ending in .png, got {Path(path).name!r}")
+    check_output("path", path, ".png")
     with whole_file(path) as temporary:
         if figure.get_layout_engine():
             figure.get_layout_engine().execute(figure)

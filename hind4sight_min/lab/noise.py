@@ -16,12 +16,10 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
 
     The SD is `standard_deviation` metres at each picture's median depth, and proportional to depth.
     depth (..., H, W) m -> the same shape and dtype; missing pixels (0) stay missing. Every pixel of every picture has
-    noise of its own.
+    noise of its own. Raises ValueError for an SD below 0 or above 10 m.
     """
     depth, = as_arrays("*HW", depth=depth)
-    check_number("standard_deviation", standard_deviation)
-    if not 0 <= standard_deviation <= 10:
-        raise ValueError(f"standard_deviation: expected 0 to 10 m, got {standard_deviation}")
+    check_number("standard_deviation", standard_deviation, least=0, most=10)
     valid = depth > 0
     pictures = depth.reshape(-1, *depth.shape[-2:])
     median = np.array([np.median(each[each > 0]) if each.any() else 1.0 for each in pictures], depth.dtype)
@@ -83,11 +81,11 @@ def smooth_depth(depth, empty_depth, images, camera):
         filled = np.where(seen, difference, mean_of_near(difference, seen, colours, px)[0])
     guess = np.stack([cv2.bilateralFilter(each, 2 * round(px * 2 / 3) + 1, 0.025, px / 2) for each in filled])
     smooth, weight = mean_of_near(difference, seen, [guess / np.float32(metres), *colours], px)
-    known = (empty_depth > 0) & (weight > ALIKE)
+    known = (empty_depth > 0) & (weight > LEAST_WEIGHT)
     return np.where(known, empty_depth + smooth, depth).astype(depth.dtype)
 
 
-ALIKE = 1e-3  # a hole is filled where the weights around it sum to more
+LEAST_WEIGHT = 1e-3  # a hole is filled where the weights around it sum to more
 
 
 def mean_of_near(values, seen, guides, px):

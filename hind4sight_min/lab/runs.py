@@ -62,8 +62,7 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     CSV. run.meta["data"] says of which data set the run is, run.meta["no_motion"] what the terms are without motion.
     jobs: processes, on which the result does not depend. on_step(run, terms), on_epoch(entry): called after each.
     Raises ValueError for another data set than the run began with, for a camera that does not show the arena, and where
-    another process writes to `path`;
-    FloatingPointError where the loss is no number any more.
+    another process writes to `path`; FloatingPointError where the loss is no number any more.
     """
     first, recipe, meta, per_epoch = run.step, run.recipe, run.meta, max(1, len(data) // run.recipe.batch)
     log, sums, before = meta.setdefault("log", []), meta.setdefault("sums", {}), meta.get("seconds", 0.0)

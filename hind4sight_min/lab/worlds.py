@@ -1,15 +1,14 @@
 """What the explorer pokes: the simulator, or the pokes of a data set where there is none. Not in the paper."""
-from dataclasses import asdict
 from importlib.util import find_spec
 
 import numpy as np
 
+from ..disk.files import data_small
 from ..disk.shards import load_interactions
 from ..planning import NoPoke
 from ..sim.arena import Arena, Settings
 from ..sim.photographs import photographs
 from ..sim.truth import find_truth, true_scene_flow
-from .cli import data_small
 from .control import carry_out, settings_for
 from .evaluation import scenes_of_pokes, true_motion
 
@@ -42,7 +41,7 @@ class Simulated:
 
     def __init__(self, settings, seed):
         self.arena = Arena(settings, np.random.default_rng(seed))
-        self.camera, self.empty_depth, self.settings = self.arena.camera, self.arena.empty_depth, asdict(settings)
+        self.camera, self.empty_depth, self.settings = self.arena.camera, self.arena.empty_depth, vars(settings)
         self.next()
 
     def next(self):
@@ -88,7 +87,7 @@ class Recorded:
 
     def __init__(self, interactions, truth, seed):
         self.interactions, self.truth, self.camera = interactions, truth, interactions.camera
-        self.empty_depth, self.settings = interactions.empty_depth, {**asdict(Settings()), **interactions.settings}
+        self.empty_depth, self.settings = interactions.empty_depth, {**vars(Settings()), **interactions.settings}
         self.scenes = np.arange(len(interactions)) if truth is None else scenes_of_pokes(truth)
         self.photographs = photographs(interactions, None, range(len(interactions)))  # shipped ones: few
         self.scene = seed - 1

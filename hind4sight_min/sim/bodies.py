@@ -15,17 +15,17 @@ from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isbuiltin
 from itertools import product
-from numbers import Real
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .. import check_number
 from ..scene import REACH, TALL
 
 LARGEST = REACH / 2  # m from the middle to any corner: wherever it is poked, the model's box has the whole of it
-FLAT = 0.012  # m; background subtraction would hardly see what is lower
+LOW = 0.012  # m; background subtraction would hardly see what is lower
 ROUND = 0.97  # a polygon of 13 corners; the turn of what is rounder cannot be seen
 CUBE = np.array(list(product((-0.5, 0.5), repeat=3)))  # its corners
 
@@ -127,8 +127,8 @@ def check_pokable(bullet, body):
     if not bullet.getDynamicsInfo(body, -1)[0] > 0:
         raise ValueError("has no mass, so that nothing moves it; expected one in kg")
     extent = measure(bullet, body)
-    if extent.height < FLAT:
-        raise ValueError(f"is {extent.height:.4f} m high as it stands; expected {FLAT:g} m or more, or it is not seen")
+    if extent.height < LOW:
+        raise ValueError(f"is {extent.height:.4f} m high as it stands; expected {LOW:g} m or more, or it is not seen")
     room = 1 / max(extent.reach / LARGEST, extent.height / TALL)
     if room < 1:
         error = ValueError(f"reaches {extent.reach:.3f} m from its middle and is {extent.height:.3f} m high as it "
@@ -217,8 +217,7 @@ def read_urdfs(paths, scale=1.0):
     scale: how many times as large as they say. Raises ValueError that names the first that cannot be used, says why and
     how many there are.
     """
-    if not (isinstance(scale, Real) and 0 < scale < float("inf")):
-        raise ValueError(f"scale: expected a finite number > 0, got {scale!r}")
+    check_number("scale", scale, above=0)
     bullet, found, wrong, least = new_world(), [], [], 1.0
     paths = [paths] if isinstance(paths, (str, Path)) else paths
     files = [os.path.abspath(file) for path in paths for file in files_named(str(path))]

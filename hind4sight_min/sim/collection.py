@@ -7,13 +7,12 @@ import numpy as np
 
 from .. import check_whole
 from ..disk.files import claim, clear_away, plain
-from ..disk.shards import find_shards, load_shard, save_shard
+from ..disk.shards import SHARD_POKES, find_shards, load_shard, save_shard
 from ..interactions import Interactions
 from .arena import Arena, Settings
 from .truth import Truth, save_truth, truth_path
 
 MOST_POKES = 1_000_000  # shards are numbered with four digits
-SHARD_POKES = 100  # one shard is one world, so the data do not depend on who collects it
 
 
 def collect_shard(settings, seed, index, pokes, world=None):

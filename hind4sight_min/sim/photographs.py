@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from ..disk.files import load_npz, save_npz, shipped
+from ..disk.shards import SHARD_POKES
 from .arena import Arena, Settings
-from .collection import SHARD_POKES, collect_shard
+from .collection import collect_shard
 
 FORMAT = "hind4sight_min photographs 1"
 ALIKE = 2.0  # of 255, on average: poses on disk are rounded, so a picture taken again differs at some edges
@@ -54,7 +55,8 @@ class Replay(Arena):
 def photographs(interactions, truth, rows, width=640):
     """Photographs of recorded pokes -> {row: (before, after)}, pictures (h, w, 3) uint8, of those rows that have any.
 
-    Those are a few shipped pokes and, where pybullet is installed, all simulated ones whose truth (or None) is known.
+    A few shipped pokes have some, and where pybullet is installed every simulated one whose truth is given, not None.
+    width: of a picture, about, in px; the shipped ones are as they are.
     """
     found = _read(interactions, rows)
     if truth is None or not {"seed", "shard"} <= set(interactions.meta):
