@@ -64,7 +64,8 @@ def begin(*work):
 
 
 def environment():
-    return {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    return {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONWARNINGS": "ignore"}  # of what the killed ones leave to their resource tracker
 
 
 def finish(*work):

@@ -5,7 +5,8 @@
 roundtrip_mm: how far a point of the imported clouds is, at most, from the one that the simulator saw, at full size.
 roundtrip_pose_mm: the same where the pose was not told but found in the empty picture; the arena's origin, which nobody
 can see, is put where it was. roundtrip_flow_mse_ratio_*: what the shipped model has on them as simulated, imported at
-full size, and at the size that it was trained with. With --sizes, imported at more sizes: what coarse pixels cost.
+full size, and at the size that it was trained with. With --sizes, imported at more sizes, the smallest of them with
+pixels twice as wide as those of the training: what coarse pixels cost.
 Ten minutes for 100 pokes at 640 x 480, most of them Bullet's.
 """
 import json

@@ -140,7 +140,8 @@ def draw(examples):
         arrow = on_table([data.starts[row], data.pokes[row, :2]], data.camera)
         for axes in line[:2]:
             draw_arrow(axes, *arrow)
-        draw_wheel(line[4], scale, low=arrow[1, 1] <= arrow[0, 1])  # what moves upwards leaves room below
+        (right, low), _ = arrow >= arrow[::-1]  # what moves leaves room behind
+        draw_wheel(line[4], scale, low, right)
         zoom(line[1:], line[:1], arrow[1], (width, height))
     return figure
 

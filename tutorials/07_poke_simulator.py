@@ -162,7 +162,8 @@ for number, (panel, frame) in enumerate(zip(axes, film)):
     for line in panel.spines.values():
         line.set(color=RED if ends else "0.8", linewidth=4)
 figure.suptitle("The finger (white cylinder) pushes and is lifted; the robot keeps the framed two, in 64 x 48 pixels"
-                if bullet else "All that the robot keeps of a poke: before and after, in 64 x 48 pixels", fontsize=11)
+                if bullet else "All that the robot keeps of a poke: these two (photographs), in 64 x 48 pixels",
+                fontsize=11)
 lesson.keep(options, figure, "film")
 
 # %% [markdown]

@@ -81,7 +81,7 @@ lesson.keep(options, lesson.architecture().draw(view=(5.0, 26.2, 5.0, 10.4)), "a
 #
 # What a finger does to an object depends on where it meets it, which a perceptron learns slowly from coordinates:
 # `networks.first_met` says it, in weights over the points, those of the sum above. `networks.height_map` says what
-# stands around the target, and is part of the context too.
+# stands around the target, `networks.wall_map` adds the walls, and both are part of the context too.
 
 # %%
 ROW = 1
@@ -89,7 +89,8 @@ one, image = data[[ROW]], data.rgb_before[ROW] / 255
 before, after = training.scenes_of(one)  # points (1, N, 3) m, valid (1, N), occupied (1, N), ...
 rows, seen = look(before, one.pokes)     # (1, M): where the model looks
 order = np.random.default_rng(0).permutation(before.points.shape[1])
-mixed = Scene(*(each[:, order] for each in (before.points, before.valid, before.occupied, before.stands_out)))
+in_another_order = (each[:, order] for each in (before.points, before.valid, before.occupied, before.stands_out))
+mixed = Scene(*in_another_order, arena=before.arena)
 straight, shuffled = (networks.predict(shipped.params, sizes, scene, one.pokes) for scene in (before, mixed))
 order_matters = np.abs(straight.points[:, order] - shuffled.points).max()
 print(f"2. The model looks at {seen.sum()} points of {before.points.shape[1]}; shuffling them changes the "

@@ -186,7 +186,7 @@ for panel in axes:
     panel.axvline(0, color="0.5", linewidth=1)
     panel.set(xlabel="everything moved along the poke by [px]")
 axes[0].set(ylabel="change of the photometric loss")
-axes[0].set_title("a tenth of a pixel of motions", fontsize=11)
+axes[0].set_title("motions of up to a twentieth of a pixel", fontsize=11)
 axes[0].legend(fontsize=9)
 axes[1].set(xlim=(-0.0055, 0.0055), ylim=(-0.02, 0.08))
 axes[1].set_title("the same, enlarged ten times: what the left picture hides", fontsize=11)

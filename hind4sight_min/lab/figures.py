@@ -174,14 +174,14 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), frameon=False)
 
 
-def draw_wheel(axes, scale, low):
+def draw_wheel(axes, scale, low, right=False):
     """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px. Not in the paper.
     """
-    y = 0.02 if low else 0.68
-    wheel = axes.inset_axes((0.02, y, 0.24, 0.30))
+    x, y = 0.54 if right else 0.02, 0.02 if low else 0.68
+    wheel = axes.inset_axes((x, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))
     wheel.axis("off")
-    axes.text(0.28, y + 0.15, f"rim:\n{scale:.1f} px", fontsize=9, va="center", transform=axes.transAxes)
+    axes.text(x + 0.26, y + 0.15, f"rim:\n{scale:.1f} px", fontsize=9, va="center", transform=axes.transAxes)
 
 
 def _draw_heatmap(axes, heatmap, place, arena, which, symbol):
@@ -282,7 +282,7 @@ def _draw_motion(panels, interactions, row, answer, truth):
     for name, title in (("flow", "Predicted optical flow\n(U, V), Sec. III-C"), ("true_flow", "True optical flow\n")):
         if name in flows:
             show_flow(panels[name], flows[name], scale, title)
-    draw_wheel(panels["flow"], scale, low=poke[1] >= start[1])  # what moves upwards leaves room below
+    draw_wheel(panels["flow"], scale, poke[1] >= start[1], poke[0] < start[0])  # what moves leaves room behind
     _draw_scene_flow(panels["scene_flow"], image.reshape(-1, 3)[valid], points[valid], arrows, start, poke[:2],
                      interactions.settings["arena"])
 
