@@ -3,8 +3,9 @@
     python benchmarks/grade_class.py --json class.json
     python benchmarks/grade_class.py --attacks --without-namespaces     # what holds where the kernel gives none
 
-Then the student's loop: one function is changed and its own test run. Then every attack by itself: a table of which got no point for it and cost the honest task none. Whatever a hostile
-submission tries is bounded (100 forks, 2 GB, 50 MB on disk, 10 s), so that a grader that fails harms no machine.
+Then the student's loop: one function is changed and its own test run. Then every attack by itself: a table
+of which got no point for it and cost the honest task none. Whatever a hostile submission tries is bounded (100 forks,
+2 GB, 50 MB on disk, 10 s), so that a grader that fails harms no machine.
 """
 import argparse
 import ast

@@ -1,10 +1,10 @@
-"""How long it takes, on one core, to learn to a given flow error: the model trained from nothing, for more and more steps.
+"""How long it takes, on one core, to learn to a given flow error: from nothing, for more and more steps.
 
     python benchmarks/minutes_to.py TRAIN TEST [--ratio 0.11] [--steps 1250 1500 2000 ...] [--json FIGURES]
 
-TRAIN, TEST: folders of `hind4sight collect`. The rate falls to zero over a run's steps, so every number of steps is a run
-of its own; the first that reaches the ratio ends the search. Minutes are of processor time, which other work on the
-machine does not count in.
+TRAIN, TEST: folders of `hind4sight collect`. The rate falls to zero over a run's steps, so every number of steps is a
+run of its own; the first that reaches the ratio ends the search. Minutes are of processor time: other work on the
+machine does not count.
 """
 import argparse
 import time

@@ -35,7 +35,7 @@ class Fault(NamedTuple):
 # file, the tests that matter, and its faults: name, text, what takes its place
 PLANTED = (
     ("__init__.py", "planning", [
-        ("the least number that is allowed is refused", "least <= value <= most", "least < value <= most")]),
+        ("the least number that is allowed is refused", "least <= value <= most:", "least < value <= most:")]),
 
     ("geometry.py", "geometry eq1_transform", [
         ("principal point in the picture's middle", "np.arange(camera.width) - camera.cx",

@@ -97,8 +97,8 @@ HEADLINES = {
                          "<= 1.5"),
     "unseen_over_seen_4000": ("reproduce", "unseen_over_seen_4000", "paper: the same, 4,000 pokes of each", "{:.2f}",
                               "<= 1.15"),
-    "full_over_se3nets_exact": ("reproduce", "full_over_se3nets_exact", "paper: against SE3-Nets with exact association",
-                                "{:.2f}", "<= 1.2"),
+    "full_over_se3nets_exact": ("reproduce", "full_over_se3nets_exact",
+                                "paper: against SE3-Nets with exact association", "{:.2f}", "<= 1.2"),
     "minutes_to_0110": ("minutes_to", "minutes", "minutes on one core to a ratio of 0.110", "{:.1f}", "<= 3"),
     "multi_flow_mse_ratio": ("contact", "multi_flow_mse_ratio", "fresh pokes that move two or more objects", "{:.2f}",
                              "<= 0.13"),
@@ -116,8 +116,8 @@ HEADLINES = {
                          "<= 0.35"),
     "plan_turn_1_object_deg": ("planning", "learned_1_angle_deg", "planning, 1 object: median orientation left, deg",
                                "{:.0f}", "<= 12"),
-    "obstacle_left_alone": ("planning", "learned_obstacle_avoided", "planning: share of runs that leave an obstacle alone",
-                            "{:.2f}", ">= 0.60"),
+    "obstacle_left_alone": ("planning", "learned_obstacle_avoided",
+                            "planning: share of runs that leave an obstacle alone", "{:.2f}", ">= 0.60"),
     "plan_over_oracle": ("planning", "plan_over_oracle", "planning: distance left / with the simulator as the model",
                          "{:.2f}", "<= 1.3"),
     "plan_step_seconds": ("planning_step", "plan_step_seconds", "planning: seconds per step", "{:.2f}", "< 2"),
@@ -226,7 +226,8 @@ def restore(folder, kept=CELLS):
 
 
 def of_today(cells):
-    """These cells {name: file's contents}; a ValueError where one is not as `hind4sight reproduce` would make it now."""
+    """These cells {name: file's contents}. Raises ValueError where `hind4sight reproduce` would make one otherwise now.
+    """
     now = {cell.name: tables.ingredients(cell, tables.FULL)
            for cell in tables.cells_of_tables(list(tables.TABLES), tables.FULL)}
     for name, cell in cells.items():

@@ -24,8 +24,8 @@ RUNS = {  # benchmark -> what it needs, its arguments, figures that must be amon
               ("collect_pokes_per_second", "train_memory_20k_over_2k", "shard_bytes_per_poke")),
     "kills": (("pybullet",), ("--pokes", "24", "--kills", "2", "1", "1", "1"), ("kills_survived", "kills_writing")),
     "mutations": ((), ("--files", "20", "--calls", "32"), ("mutated_files_held", "wrong_calls_held")),
-    "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1", "--only",
-                                                    "ours", "torch_1_threads", "point_cloud_utils", "scipy"),
+    "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1",
+                                                    "--only", "ours", "torch_1_threads", "point_cloud_utils", "scipy"),
                    ("chamfer_100_speedup_vs_point", "chamfer_100_speedup_vs_torch_max",
                     "warp_24x32_speedup_vs_scipy", "warp_speedup_vs_grid_sample_min")),
     "training_step": (("torch",), ("--batch", "9", "--before", ROOT, "--seconds", "0.1", "--only", "ours_1_process",
@@ -67,8 +67,8 @@ def test_minutes_to_a_ratio_ends_with_the_first_run_that_reaches_it(tmp_path):
         save_truth(tmp_path / name / "shard_0000.npz", load_truth(ROOT / "data_small" / "test")[:count])
     command = [sys.executable, ROOT / "benchmarks" / "minutes_to.py", tmp_path / "train", tmp_path / "test"]
     for ratio, asked in ((99, [1]), (0, [1, 2])):
-        subprocess.run([*command, "--ratio", str(ratio), "--steps", "2", "1", "--json", tmp_path / "found.json"], check=True,
-                       capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        subprocess.run([*command, "--ratio", str(ratio), "--steps", "2", "1", "--json", tmp_path / "found.json"],
+                       check=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
         found = json.loads((tmp_path / "found.json").read_text())
         assert [steps for steps in (1, 2) if f"steps_{steps}_ratio" in found] == asked
         assert ("minutes" in found) == (ratio > 0)
@@ -83,6 +83,7 @@ def test_the_table_of_camera_faults_runs(tmp_path):
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures.pop("table").count("\n") == 1 + 9
-    assert {f"camera_{row}_flow_mse_ratio" for row in ("clean", "noisy", "missing30", "pitch1", "shift1")} <= set(figures)
+    rows = "clean", "noisy", "missing30", "pitch1", "shift1"
+    assert {f"camera_{row}_flow_mse_ratio" for row in rows} <= set(figures)
     ratios = [value for name, value in figures.items() if name.endswith("_flow_mse_ratio")]
     assert len(set(ratios)) == len(ratios) == 9, "rows that are the same: is a fault not passed on?"

@@ -59,7 +59,8 @@ def test_settings_accept_their_limits_and_leave_out_what_is_held_out():
 
 
 @pytest.mark.parametrize("changed", [
-    dict(kinds=("carton", "teapot")), dict(kinds=()), dict(own=[]), dict(own=("a.urdf",)), dict(kinds="can"), dict(textures=("marble",)), dict(textures=[]),
+    dict(kinds=("carton", "teapot")), dict(kinds=()), dict(own=[]), dict(own=("a.urdf",)),
+    dict(kinds="can"), dict(textures=("marble",)), dict(textures=[]),
     dict(objects_min=0), dict(objects_min=1.5), dict(objects_max=8), dict(objects_max=2), dict(width=64.0, height=48),
     dict(width=8, height=6), dict(width=64, height=64), dict(width=0, height=0), dict(arena=-0.5), dict(arena=0.6),
     dict(arena=float("nan")), dict(cell=0), dict(cell=0.03), dict(poke_length=(0.18, 0.14)), dict(poke_length=0.16),

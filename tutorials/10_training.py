@@ -191,7 +191,7 @@ axes[0].legend(fontsize=9)
 axes[1].set(xlim=(-0.0055, 0.0055), ylim=(-0.02, 0.08))
 axes[1].set_title("the same, enlarged ten times: what the left picture hides", fontsize=11)
 dip = change[1].argmin()
-axes[1].annotate(f"a dip of {-change[1, dip]:.3f} at {SHIFTS[dip]:.3f} px:\nthe object's gain", 
+axes[1].annotate(f"a dip of {-change[1, dip]:.3f} at {SHIFTS[dip]:.3f} px:\nthe object's gain",
                  (SHIFTS[dip], change[1, dip]), (0.0012, 0.03), fontsize=9, arrowprops={"arrowstyle": "->"})
 figure.suptitle("A kink at no motion holds everything in place; a little noise rounds it off", fontsize=11)
 lesson.keep(options, figure, "kink")

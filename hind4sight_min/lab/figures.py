@@ -175,8 +175,7 @@ def _draw_scene_flow(axes, image, points, flows, start, target, arena):
 
 
 def draw_wheel(axes, scale, low, right=False):
-    """The legend of a flow in a corner of its panel, low or high: the wheel, and what its rim is, px. Not in the paper.
-    """
+    """The legend of a flow in a corner of its panel: the wheel, and what its rim is, px. Not in the paper."""
     x, y = 0.54 if right else 0.02, 0.02 if low else 0.68
     wheel = axes.inset_axes((x, y, 0.24, 0.30))
     wheel.imshow(colour_wheel(64))

@@ -85,7 +85,7 @@ class Settings:
         return plain({**{name: value for name, value in vars(self).items() if name != "own"}, **own})
 
 
-# Fewer objects, none that topples, near the middle: what a model learns within minutes. data_small is made so.
+# Fewer objects, none that topples, near the middle: what a model learns within minutes. data_small is so, with 25 N.
 MIDDLE = {"objects_max": 4, "place_within": 0.7, "kinds": ("carton", "can", "bracket", "pot")}
 
 
