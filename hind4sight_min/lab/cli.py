@@ -255,7 +255,8 @@ def run_reproduce(args):
                                       progress_line("poke"))
             print(contact.contact_table(found))
         elif args.table == "planning":
-            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map)
+            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map,
+                                                             args.planners)
             print(tables.planning_table(found))
             figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
         else:
@@ -484,6 +485,8 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                   "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G; "
                   "contact: a model's error by what met what, in minutes"},
         "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with"},
+        "--planners": {"nargs": "+", "choices": list(tables.PLANNERS), "default": list(tables.PLANNERS),
+                       "help": "of planning: which; all of them take hours"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
         "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
