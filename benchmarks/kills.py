@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from hind4sight_min.disk.checkpoints import load_run
-from hind4sight_min.disk.files import write_json
+from hind4sight_min.disk.files import plain, write_json
 from hind4sight_min.disk.shards import load_interactions
 from hind4sight_min.lab.processes import parallel_map
 from hind4sight_min.lab.runs import train_saving
@@ -210,7 +210,7 @@ def main():
             figures["cluster_identical"] = float(identical)
         figures["kills_survived"] = sum(figures.get(f"kills_{name}", 0) for name in (
             "collection", "training", "workers"))
-    write_json(args.json, figures)
+    write_json(args.json, plain(figures))
 
 
 if __name__ == "__main__":

@@ -15,10 +15,12 @@ from .files import whole_file, write_json, write_text
 from .shards import DEPTH_UNIT, counts_of
 
 CAMERA, POKES, EMPTY = "camera.json", "pokes.csv", "empty_depth"
+NEEDED = "width", "height", "camera_matrix", "depth_unit"
 COLUMNS = ("name", "target_x", "target_y", "direction", "start_x", "start_y")
 SETTINGS = {"arena": 0.5, "cell": 0.025, "poke_length": [0.10, 0.14], "finger_radius": 0.01}  # m
 SHAPES = {"camera_matrix": [(3, 3)], "distortion": [(count,) for count in (0, 4, 5, 8, 12, 14)], "depth_unit": [()],
           "arena_from_camera": [(4, 4)], "origin": [(2,)]}
+MOST_SIDE = 5.0  # m, of an arena: larger ones are told in mm
 MOST_TEXT = 100e6  # bytes
 
 
@@ -61,7 +63,12 @@ class Recording:
         if not isinstance(self.settings, dict):
             raise ValueError(f"settings: expected names and values, got {self.settings!r}")
         object.__setattr__(self, "settings", {**SETTINGS, **self.settings})
-        side = _numbers("settings: arena", self.settings["arena"], ())
+        for name, value in SETTINGS.items():
+            if not (0 < _numbers(f"settings: {name}", self.settings[name], np.shape(value))).all() or (
+                    np.max(self.settings[name]) > MOST_SIDE):
+                raise ValueError(f"settings: {name}: expected above 0 and up to {MOST_SIDE:g} m, got "
+                                 f"{self.settings[name]}")
+        side = self.settings["arena"]
         for name in ("width", "height"):
             check_whole(name, getattr(self, name), 1, 10_000)
         for name, shapes in SHAPES.items():
@@ -73,6 +80,8 @@ class Recording:
         (fx, skew, _), (below, fy, _), last = matrix = self.camera_matrix
         if skew or below or last.tolist() != [0, 0, 1] or not min(fx, fy) > 0:
             raise ValueError(f"camera_matrix: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {matrix.tolist()}")
+        if not 0.1 < fx / self.width < 100:
+            raise ValueError(f"camera_matrix: expected fx in pixels of these pictures, {self.width} wide, got {fx:g}")
         if self.origin is not None and self.arena_from_camera is not None:
             raise ValueError("origin: expected none beside arena_from_camera, which says where it is")
         for name, poke, start in zip(self.names, self.pokes, self.starts):
@@ -128,7 +137,9 @@ def _rows(text):
         if not name or Path(name).name != name or name in found:
             raise ValueError(f"line {reader.line_num}: expected a name of its own, of files here, got {name!r}")
         try:
-            found[name] = [float(row[column]) for column in COLUMNS[1:]]
+            found[name] = [float(row.pop(column)) for column in COLUMNS[1:]]
+            if len(row) > 1:  # more columns than the heading has: decimal commas, perhaps
+                raise ValueError
         except (TypeError, ValueError):
             raise ValueError(f"line {reader.line_num}: expected a name and five numbers") from None
     if not found:
@@ -141,41 +152,52 @@ def load_recording(folder):
     """The recording in a folder -> Recording. Raises ValueError naming the file and what is wrong with it."""
     path = Path(folder) / CAMERA
     try:
-        entries, known = dict(json.loads(_text(path))), [each.name for each in fields(Recording)][4:]
+        entries, known = json.loads(_text(path)), [each.name for each in fields(Recording)][4:]
+        if not isinstance(entries, dict):
+            raise ValueError(f"expected names and values, got {str(entries):.99}")
         if set(entries) - set(known):
             raise ValueError(f"expected no other entries than {', '.join(known)}, got {', '.join(entries)}")
+        if not {*NEEDED} <= set(entries):
+            raise ValueError(f"expected {', '.join(NEEDED)} at least, got {', '.join(entries) or 'none'}")
         path = Path(folder) / POKES
         names, values = _rows(_text(path))
         path = Path(folder)
         return Recording(path, names, values[:, :3], values[:, 3:], **entries)
-    except (TypeError, ValueError, csv.Error) as error:
+    except (TypeError, ValueError, RecursionError, csv.Error) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def save_recording(folder, parts):
     """Write the parts of a data set, Interactions each, as one recording; the unit of depth is DEPTH_UNIT -> how many
-    pokes. Raises ValueError for a folder with anything in it.
+    pokes. Raises ValueError for a folder with anything in it. However it fails, no picture is left.
     """
-    folder, rows = Path(folder), []
+    folder, rows, written = Path(folder), [], []
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: expected a new or an empty folder")
 
     def write(name, picture):
-        with whole_file(folder / f"{name}.png") as temporary:
+        written.append(folder / f"{name}.png")
+        with whole_file(written[-1]) as temporary:
             temporary.write_bytes(cv2.imencode(".png", picture)[1])
-    for part in parts:
-        for i in range(len(part)):
-            name = f"{len(rows):04d}"
-            for when in ("before", "after"):
-                write(f"{name}_{when}", getattr(part, f"rgb_{when}")[i][..., ::-1])
-                write(f"{name}_{when}_depth", counts_of(getattr(part, f"depth_{when}")[i]))
-            rows.append(",".join([name, *(repr(float(value)) for value in (*part.pokes[i], *part.starts[i]))]))
-    camera = part.camera
-    write(EMPTY, counts_of(part.empty_depth))
-    write_text(folder / POKES, "\n".join([",".join(COLUMNS), *rows]) + "\n")
-    matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    write_json(folder / CAMERA, {  # last, so that there is no half recording
-        "width": camera.width, "height": camera.height, "camera_matrix": matrix, "depth_unit": DEPTH_UNIT,
-        "distortion": [], "arena_from_camera": camera.plain["arena_from_camera"], "settings": part.settings,
-        "seed": part.meta.get("seed")})
+    try:
+        for part in parts:
+            for i in range(len(part)):
+                name = f"{len(rows):04d}"
+                for when in ("before", "after"):
+                    write(f"{name}_{when}", getattr(part, f"rgb_{when}")[i][..., ::-1])
+                    write(f"{name}_{when}_depth", counts_of(getattr(part, f"depth_{when}")[i]))
+                rows.append(",".join([name, *(repr(float(value)) for value in (*part.pokes[i], *part.starts[i]))]))
+        camera = part.camera
+        write(EMPTY, counts_of(part.empty_depth))
+        written.append(folder / POKES)
+        write_text(written[-1], "\n".join([",".join(COLUMNS), *rows]) + "\n")
+        matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        write_json(folder / CAMERA, {  # last, so that there is no half recording
+            "width": camera.width, "height": camera.height, "camera_matrix": matrix, "depth_unit": DEPTH_UNIT,
+            "distortion": [], "arena_from_camera": camera.plain["arena_from_camera"], "settings": part.settings,
+            "seed": part.meta.get("seed")})
+    except BaseException:  # an interrupt, a full disk, a damaged shard: then the folder is as it was
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
     return len(rows)

@@ -304,7 +304,8 @@ def optical_table(figures):
 def tables_text(tables, figures):
     """The asked-for tables as Markdown."""
     made = {"optical-flow": [optical_table], "ablation": [partial(flow_table, name="ablation"), order_table]}
-    return "\n\n".join(make(figures) for name in tables for make in made.get(name, [partial(flow_table, name=name)]))
+    texts = [make(figures) for name in tables for make in made.get(name, [partial(flow_table, name=name)])]
+    return "\n\n".join(text for text in texts if text.count("\n") > 1)  # not those without a row
 
 
 # --- planning (Sec. IV-G) -----------------------------------------------------------------------------------------
