@@ -210,7 +210,7 @@ def blank():
 
 
 @pytest.mark.parametrize("line", ["drag 1 2 3", "drag 1 2", "drag 1 2 3 x", "fly 1 2 3 4", "key", "key x", "wait",
-                                  "wait long"])
+                                  "wait long", "drag", "goal inf 1 2 3", "wait -1", "wait nan", "wait 1e9"])
 def test_a_script_that_says_something_else_is_refused_in_one_line(line, blank):
     with pytest.raises(ValueError, match="^script, line 2: expected drag or goal X Y X Y, key K, or wait SEC.*'$"):
         explore.play(blank, ["wait 0", line])

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from .. import check_number
 from ..geometry import rigid, so3_exp, unproject
 from ..training import unsupervised
-from .noise import add_depth_noise, smooth_depth
+from .noise import MOST_NOISE, add_depth_noise, smooth_depth
 
 # --- the faults -------------------------------------------------------------------------------------------------
 
@@ -71,10 +72,15 @@ def with_faults(interactions, rng, depth_noise=0.0, missing=(), pitch_error=0.0,
     a shift in any direction, drawn once for all these pokes: a camera stands still. The empty arena is known without
     noise, as a mean of many pictures, but from the same wrong pose. Raises ValueError for what no camera does.
     """
-    degrees, metres = pose_error or (0, 0)
-    for name, value, most in (("pitch_error", pitch_error, 45), ("pose_error", degrees, 45), ("pose_error", metres, 1)):
+    if np.shape(pose_error) not in ((0,), (2,)):
+        raise ValueError(f"pose_error: expected (degrees, m), got {pose_error}")
+    (degrees, metres), missing = pose_error or (0, 0), [missing] if np.ndim(missing) == 0 else missing
+    for name, value, most, unit in (
+            ("depth_noise", depth_noise, MOST_NOISE, "m"), ("pose_error", metres, 1, "m"),
+            ("pitch_error", pitch_error, 45, "degrees"), ("pose_error", degrees, 45, "degrees")):
+        check_number(name, value, 0 if name == "depth_noise" else -np.inf)
         if not abs(value) <= most:
-            raise ValueError(f"{name}: expected at most {most} {'m' if most == 1 else 'degrees'}, got {value}")
+            raise ValueError(f"{name}: expected at most {most} {unit}, got {value}")
     pictures = np.stack([interactions.depth_before, interactions.depth_after])
     seen = np.stack([add_depth_noise(each, rng, depth_noise) for each in pictures]) if depth_noise else pictures
     if missing:

@@ -24,7 +24,7 @@ from ..sim.photographs import photographs
 from ..sim.truth import find_truth
 from . import cameras, contact, control, evaluation, tables
 from .camera_faults import ONE_SIDED, under_faults
-from .noise import under_noise
+from .noise import MOST_NOISE, under_noise
 from .processes import parallel_map
 from .runs import total, train_saving
 
@@ -137,9 +137,12 @@ def new_run(interactions, weight=(), masks=None, width=None, depth_noise=0.0, ca
     """A fresh Run as the options of `train` say; with start_from, a path, from the parameters of that checkpoint."""
     if depth_noise and camera_faults:
         raise ValueError("--depth-noise: --camera-faults has a noise of its own")
+    if not 0 <= depth_noise <= MOST_NOISE:
+        raise ValueError(f"--depth-noise: expected 0 to {MOST_NOISE} m, got {depth_noise}")
     start = start_from and checkpoints.load_run(start_from)
     sizes = start.recipe.sizes if start else Sizes()
-    asked = replace(sizes, masks=masks or sizes.masks, width=width or sizes.width)
+    given_sizes = {name: value for name, value in (("masks", masks), ("width", width)) if value is not None}
+    asked = replace(sizes, **given_sizes)
     if start and asked != sizes:
         raise ValueError(f"--start-from: {start_from} has {sizes.masks} masks and a width of {sizes.width}, expected "
                          f"{asked.masks} and {asked.width}")
@@ -355,11 +358,13 @@ def run_grade(args):
 # --- the command line -----------------------------------------------------------------------------------------
 
 def term_weight(text):
-    """'photometric=0.5' -> ('photometric', 0.5). Raises ValueError for anything else; argparse then says so."""
-    name, value = text.split("=")
-    if name not in training.WEIGHTS:
-        raise ValueError
-    return name, float(value)
+    """'photometric=0.5' -> ('photometric', 0.5). Raises argparse's error for anything else."""
+    name, _, value = text.partition("=")
+    try:
+        return {name: (name, float(value)) for name in training.WEIGHTS}[name]
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"expected TERM=VALUE, a term of {', '.join(training.WEIGHTS)} and a number, "
+                                         f"got {text!r}") from None
 
 
 def missing_kind(text):
@@ -371,8 +376,11 @@ def missing_kind(text):
 
 
 def part_of(text):
-    """'3/8' -> (3, 8). Raises ValueError for anything else; argparse then says so."""
-    which, parts = map(int, text.split("/"))
+    """'3/8' -> (3, 8). Raises argparse's error for anything else."""
+    try:
+        which, parts = map(int, text.split("/"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected I/N, two whole numbers, got {text!r}") from None
     return which, parts
 
 
@@ -547,13 +555,16 @@ def main(arguments=None):
         parser.print_help()
         return 0
     try:
+        for name, value in vars(args).items():
+            if value == "" or isinstance(value, list) and "" in value:  # an unset variable of the shell's
+                raise ValueError(f"{name}: expected something, got an empty text")
         if getattr(args, "json", None):
             check_output("--json", args.json, ".json")
         args.function(args)
     except BrokenPipeError:
         raise
     except (ValueError, RuntimeError, OSError, FloatingPointError) as error:
-        print(f"hind4sight {args.command}: {error}", file=sys.stderr)
+        print(f"hind4sight {args.command}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"\nhind4sight {args.command}: stopped; what is on disk is whole{GO_ON.get(args.command, '')}",

@@ -155,6 +155,8 @@ def evaluate(run, interactions, truth=None, progress=None, **faults):
     progress(done, total) is called after every poke.
     """
     pokes = []
+    if not len(interactions):
+        raise ValueError("interactions: expected a poke at least, got none")
     for row in range(len(interactions)):
         pokes.append(label_free_errors(run, interactions, row, **faults) if truth is None else
                      errors_of_poke(run, interactions, truth, row, **faults))

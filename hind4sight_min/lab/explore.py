@@ -277,6 +277,9 @@ def direction(pokes):
 
 # --- the command, and a script in place of the mouse --------------------------------------------------------------
 
+LONGEST = 60  # s, that a film waits
+
+
 def play(explorer, lines):
     """Do what the lines of a script say, by the events that mouse and keys make.
 
@@ -293,16 +296,21 @@ def play(explorer, lines):
                 events, times = [KeyEvent("key_press_event", canvas, key)], 8
             elif word == "wait":
                 seconds, = map(float, rest)
+                if not 0 <= seconds <= LONGEST:
+                    raise ValueError
                 if explorer.frames:
                     explorer.frames += explorer.frames[-1:] * round(10 * seconds)
             else:
                 corners = np.reshape([float(each) for each in rest], (-1, 2))
+                if not (len(corners) and np.abs(corners).max() < 1e6):
+                    raise ValueError
                 way = np.linspace(corners[:-1], corners[1:], 8, endpoint=False).swapaxes(0, 1).reshape(-1, 2)
                 names = ["button_press_event", *(len(way) - 1) * ["motion_notify_event"], "button_release_event"]
                 events = [MouseEvent(name, canvas, *camera.transform(place), {"drag": 1, "goal": 3}[word])
                           for name, place in zip(names, [*way, corners[-1]], strict=True)]
         except (KeyError, ValueError):
-            raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, "
+            raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, 0 to "
+                             f"{LONGEST}, "
                              f"got {line.strip()!r}") from None
         filmed = len(explorer.frames or ())
         for event in events:

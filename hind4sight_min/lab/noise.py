@@ -11,6 +11,9 @@ from ..disk.shards import DEPTH_UNIT
 from ..training import unsupervised
 
 
+MOST_NOISE = 0.1  # m, that anybody's pokes are seen with: more leaves no table
+
+
 def add_depth_noise(depth, rng, standard_deviation=0.01):
     """Gaussian depth noise that grows with depth. Paper: Sec. IV-B, "SD of 1 cm, scaled by the depth".
 
