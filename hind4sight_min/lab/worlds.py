@@ -4,6 +4,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
+from .. import check_whole
 from ..disk.shards import load_interactions
 from ..planning import NoPoke
 from ..sim.arena import Arena, Settings
@@ -121,6 +122,7 @@ class Recorded:
 
 def world_of(run, data, seed):
     """The pokes of the folder `data`; of None the simulator, or the shipped pokes where pybullet is not installed."""
+    check_whole("seed", seed, 0)
     if data is None and find_spec("pybullet"):
         return Simulated(settings_for(run), seed)
     data = data or data_small() / "test"
