@@ -64,6 +64,7 @@ def test_an_export_that_fails_leaves_no_picture_and_the_folder_free(tmp_path, ca
 
 @pytest.mark.parametrize("arguments, said", [
     ("collect mine", "mine: expected a folder, or a place for one"), ("import r mine/out", "mine: expected a folder"),
+    ("plan run.npz --out mine", "--out: mine is no folder"), ("plan run.npz --scale 2", "--scale: expected --urdf"),
     ("evaluate run.npz none", "shard_0000.npz: expected a poke at least, got none"),
     ("show run.npz none", "shard_0000.npz: expected a poke at least, got none"),
     ("collect |", "out: expected something, got an empty text"),
