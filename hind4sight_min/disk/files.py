@@ -69,6 +69,8 @@ def check_output(name, path, ending):
         raise ValueError(f"{name}: expected a name ending in {ending}, got {path.name!r}")
     if path.is_symlink() or path.exists() and not path.is_file():
         raise ValueError(f"{name}: {path} is a link, a folder or a device; expected a plain file or a new name")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise ValueError(f"{name}: {path.parent} is no folder")
 
 
 # --- several processes, perhaps of several machines ----------------------------------------------------------------

@@ -281,7 +281,9 @@ def run_plan(args):
     if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search, path = planning.Search(**options), Path(args.out) / "plan.gif"
-    settings = replace(control.settings_for(run), **drawn_from(args)) if args.urdf else control.settings_for(run)
+    drawn, settings = drawn_from(args), control.settings_for(run)
+    settings = replace(settings, **drawn) if args.urdf else settings
+    check_output("--out", path, ".gif")
     with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
@@ -294,8 +296,8 @@ def run_plan(args):
     figures.save_sequence(path, record, task.arena.camera)
     print(f"  stopped: {record['stopped']}")
     print(f"{path}: {len(distance) - 1} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
-    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0]),
-                           "plan_stopped": record["stopped"]})
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_stopped": record["stopped"],
+                           "plan_distance_left": float(distance[-1] / (distance[0] or 1))})  # of a goal that is met, 0
 
 
 # --- the demo ----------------------------------------------------------------------------------------------

@@ -51,6 +51,7 @@ class Explorer:
         if yours:
             figure.text(0.99, 0.022, f"yours: {', '.join(yours)}", ha="right", color=figures.TRUE)
         self.rng, self.saved, self.frames, self.held, self.marking = np.random.default_rng(0), 0, None, None, False
+        self.refused = None  # the last line that said what cannot be
         if self.canvas.manager:  # Matplotlib's own keys mean something else
             self.canvas.mpl_disconnect(self.canvas.manager.key_press_handler_id)
         for name, action in (("draw", self._drawn), ("button_press", partial(self.attempt, self._press)),
@@ -143,10 +144,11 @@ class Explorer:
         """Do it and draw. What cannot be is said in a line, as is what is wrong with a student's code."""
         try:
             action(*given)
-        except Exception as error:
-            if not (self.yours or isinstance(error, ValueError)):
+        except (Exception, SystemExit) as error:
+            if not (self.yours or isinstance(error, (ValueError, OSError))):
                 raise
-            self.say(described(error) if self.yours else str(error))
+            self.refused = described(error) if self.yours else str(error)
+            self.say(self.refused)
         self.paint()
 
     def _press(self, event):
@@ -326,14 +328,20 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
     minds the mouse. Raises RuntimeError where it can do neither.
     """
     run = load_run(checkpoint or data_small() / "checkpoint.npz")
-    yours = [name for folder in mine or () for name in take_written(folder)]
+    world = world_of(run, data, seed)
     if figure is None:
         import matplotlib.pyplot as plt
         with rc_context({"toolbar": "None"}):
             figure = plt.figure("hind4sight explore", figsize=SIZE)
         if plt.get_backend().lower() == "agg":
             raise RuntimeError("no window can be opened here; --script FILE and --demo OUT.gif need none")
-    return Explorer(figure, world_of(run, data, seed), run, out, yours)
+    try:
+        yours = [name for folder in mine or () for name in take_written(folder)]
+        return Explorer(figure, world, run, out, yours)
+    except (Exception, SystemExit) as error:
+        if not mine or described(error) == f"ValueError: {error}":  # not the student's
+            raise
+        raise ValueError(f"mine: {described(error)}") from None
 
 
 def run_explore(args):
@@ -351,3 +359,5 @@ def run_explore(args):
     if args.demo:
         figures.save_film(args.demo, explorer.frames, 0.1)
         print(f"{args.demo}: {len(explorer.frames) / 10:.0f} s")
+    if args.script and explorer.refused:  # nobody may have been looking
+        raise ValueError(f"script: {explorer.refused}")
