@@ -8,6 +8,7 @@ poke is the first whose predicted motion is long enough to see. Needs pybullet; 
 model give the same file.
 """
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -226,4 +227,8 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"hero.py: {error}", file=sys.stderr)
+        sys.exit(2)

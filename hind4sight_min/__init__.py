@@ -62,7 +62,7 @@ def as_arrays(patterns, **arrays):
     for (name, value), pattern in zip(arrays.items(), patterns.split(), strict=True):
         _, kinds, expected = next(each for each in TYPES if each[0] in name)
         try:
-            array = value if hasattr(value, "dtype") else np.asarray(value)  # a box of autograd's stays one
+            array = value if hasattr(value, "_value") else np.asanyarray(value)  # a box of autograd's stays one
         except ValueError:  # rows of several lengths
             array = np.array(None)
         if isinstance(array, np.ndarray):  # OpenCV takes another byte order for this machine's

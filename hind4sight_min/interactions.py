@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from . import as_arrays
+from . import as_arrays, check_number
 from .geometry import Camera
 
 PER_POKE = ("rgb_before", "rgb_after", "depth_before", "depth_after", "pokes", "starts")
@@ -38,10 +38,10 @@ class Interactions:
 
     def __post_init__(self):
         count, size = len(*as_arrays("M3", pokes=self.pokes)), (self.camera.height, self.camera.width)
+        settings = self.meta.get("settings") if isinstance(self.meta, dict) else None
         for name in ("arena", "cell"):
-            settings = self.meta.get("settings")
-            if not (isinstance(settings, dict) and 0 < settings.get(name, 0) < float("inf")):
-                raise ValueError(f"meta: expected settings with a positive {name!r} in m")
+            check_number(f"meta: expected settings with a positive {name!r} in m",
+                         settings.get(name) if isinstance(settings, dict) else None, above=0)
         if not 1 <= settings["arena"] / settings["cell"] <= 500:
             raise ValueError(f"meta: expected 1 to 500 cells along the arena, got a 'cell' of {settings['cell']} m")
         expected = {"rgb_before": (count, *size, 3), "rgb_after": (count, *size, 3),

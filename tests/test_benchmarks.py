@@ -22,7 +22,7 @@ RUNS = {  # benchmark -> what it needs, its arguments, figures that must be amon
     "planning": (("pybullet",), ("--before", ROOT), ("plan_candidates_per_second", "plan_speedup_vs_before")),
     "scale": (("pybullet",), ("--pokes", "8", "--steps", "1", "--jobs", "1"),
               ("collect_pokes_per_second", "train_memory_20k_over_2k", "shard_bytes_per_poke")),
-    "kills": (("pybullet",), ("--pokes", "24", "--kills", "2", "1", "1", "1"), ("kills_survived", "kills_writing")),
+    "kills": (("pybullet",), ("--pokes", "12", "--kills", "1", "1", "1", "1"), ("kills_survived", "kills_writing")),
     "mutations": ((), ("--files", "20", "--calls", "32"), ("mutated_files_held", "wrong_calls_held")),
     "operations": (("torch", "point_cloud_utils"), ("--points", "100", "--pictures", "24x32", "--seconds", "0.1",
                                                     "--only", "ours", "torch_1_threads", "point_cloud_utils", "scipy"),

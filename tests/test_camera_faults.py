@@ -114,7 +114,8 @@ def test_noise_is_that_of_sec_iv_b_and_without_faults_nothing_changes():
     *[({"missing": (kind,)}, f"missing.*rims, shadow.*{kind}") for kind in (0.0, 1.0, -0.1, float("nan"), "rim")],
     *[({"pitch_error": bad}, "pitch_error.*degrees") for bad in (46, float("nan"), -float("inf"))],
     ({"pose_error": (46, 0)}, "pose_error.*degrees"), ({"pose_error": (0, 1.1)}, "pose_error: .*1 m"),
-    ({"depth_noise": -0.01}, "standard_deviation")])
+    ({"depth_noise": -0.01}, "standard_deviation"), ({"depth_noise": 1.0}, "depth_noise: expected at most 0.1 m"),
+    ({"pose_error": 1.0}, "pose_error: expected .*degrees, m"), ({"pitch_error": "1"}, "pitch_error: expected")])
 def test_refusals(faults, named):
     with pytest.raises(ValueError, match=named):
         with_faults(tiny_pokes(), np.random.default_rng(0), **faults)

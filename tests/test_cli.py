@@ -157,7 +157,7 @@ def test_every_layer_of_the_shipped_checkpoint_is_alive():
     predicted = predict(run.params, run.recipe.sizes, before, data.pokes).points
     now, said, then = (state_embedding(run.params, points, occupied) for points, occupied in (
         (before.points, before.occupied), (predicted, before.occupied), (after.points, after.occupied)))
-    assert np.abs(said - then).sum() < 0.6 * np.abs(now - then).sum(), "no nearer to the next state than this one is"
+    assert np.abs(said - then).sum() < 0.8 * np.abs(now - then).sum(), "no nearer to the next state than this one is"
 
 
 def test_show_draws_the_row_asked_for_or_a_poke_that_moves_something(small, tmp_path, capsys, monkeypatch):

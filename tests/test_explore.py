@@ -210,7 +210,7 @@ def blank():
 
 
 @pytest.mark.parametrize("line", ["drag 1 2 3", "drag 1 2", "drag 1 2 3 x", "fly 1 2 3 4", "key", "key x", "wait",
-                                  "wait long"])
+                                  "wait long", "drag", "goal inf 1 2 3", "wait -1", "wait nan", "wait 1e9"])
 def test_a_script_that_says_something_else_is_refused_in_one_line(line, blank):
     with pytest.raises(ValueError, match="^script, line 2: expected drag or goal X Y X Y, key K, or wait SEC.*'$"):
         explore.play(blank, ["wait 0", line])
@@ -218,8 +218,15 @@ def test_a_script_that_says_something_else_is_refused_in_one_line(line, blank):
 
 @pytest.mark.parametrize("arguments, said", [
     (["--demo", "film.png"], "--demo: expected a name ending in .gif"), (["--mine", "."], "folder: expected one with"),
-    (["no.npz"], "no.npz: no such file")])
+    (["no.npz"], "no.npz: no such file"), (["--mine", "syntax"], "mine: SyntaxError: "),
+    (["--mine", "exits"], "mine: SystemExit: 4 (line 1: raise SystemExit(4))"),
+    ([str(FOLDER), "--seed", "-1"], "seed: expected a whole number >= 0, got -1"),
+    ([str(FOLDER), "--script", "undo"], "script: There is no poke to take back.")])
 def test_what_cannot_be_explored_is_refused_in_one_line(arguments, said, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["explore", *arguments, "--script", "none"]) == 2
+    (tmp_path / "undo").write_text("key u\nwait 0\n")
+    for name, text in (("syntax", "def f(:"), ("exits", "raise SystemExit(4)")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "camera.py").write_text(text)
+    assert main(["explore", "--script", "none", *arguments]) == 2
     assert capsys.readouterr().err.startswith(f"hind4sight explore: {said}")

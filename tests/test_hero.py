@@ -1,5 +1,8 @@
 """The README's animation: filming changes nothing, what is kept is what was shown, and the file is small."""
 import importlib.util
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +46,12 @@ def test_frames_are_kept_with_their_durations(tmp_path):
             corners.append(np.asarray(film.convert("RGB"))[film.height // 2, film.width // 4])
     assert durations == [500, 1500]
     np.testing.assert_allclose(corners, [[0] * 3, [255] * 3], atol=8)
+
+
+def test_a_missing_checkpoint_is_one_line(tmp_path):
+    done = subprocess.run([sys.executable, DOCS / "hero.py", "--checkpoint", "no.npz", "--out", tmp_path / "film.gif"],
+                          env={**os.environ, "PYTHONPATH": str(DOCS.parent)}, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, "hero.py: no.npz: no such file\n")
 
 
 def test_the_shipped_animation_is_small_and_wide():

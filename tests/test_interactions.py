@@ -43,7 +43,8 @@ def test_a_single_row_is_no_selection():
     *[(name, lambda a, bad=bad: np.where(np.arange(a.shape[-1]) == 0, np.float32(bad), a), "finite")
       for name in ("pokes", "starts", "depth_after", "empty_depth") for bad in (np.nan, np.inf)],
     *[("meta", lambda meta, bad=bad: {"settings": bad}, "settings with a positive")
-      for bad in (None, {"arena": 0.5}, {"arena": -1, "cell": 0.1}, {"arena": float("inf"), "cell": 0.1})]])
+      for bad in (None, {"arena": 0.5}, {"arena": -1, "cell": 0.1}, {"arena": float("inf"), "cell": 0.1},
+                  {"arena": "0.5", "cell": 0.1}, {"arena": 0.5, "cell": None})]])
 def test_a_record_refuses_other_shapes_types_and_values(name, spoil, said):
     with pytest.raises(ValueError, match=f"{name}: expected.*{said.removeprefix('expected ')}"):
         replace(tiny_pokes(), **{name: spoil(getattr(tiny_pokes(), name))})

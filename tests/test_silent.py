@@ -30,7 +30,10 @@ import mutations  # noqa: E402
 
 
 def run(*arguments):
-    return main([str(each) for each in arguments])
+    try:
+        return main([str(each) for each in arguments])
+    except SystemExit as refused:  # argparse's way
+        return refused.code
 
 
 def dead_process():
@@ -51,6 +54,31 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"model\.npz: could not be written: No space left on device"):
         files.save_npz(tmp_path / "model.npz", {}, {})
     assert not list(tmp_path.iterdir())
+
+
+def test_an_export_that_fails_leaves_no_picture_and_the_folder_free(tmp_path, capsys):
+    data_set(tmp_path / "data", count=2)
+    (tmp_path / "data" / "shard_0001.npz").write_text("damaged")
+    assert run("export", tmp_path / "data", tmp_path / "out") == 2
+    assert re.search(r"shard_0001.npz: damaged .*\(no .npz file\)", capsys.readouterr().err)
+    assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("arguments, said", [
+    ("collect mine", "mine: expected a folder, or a place for one"), ("import r mine/out", "mine: expected a folder"),
+    ("plan run.npz --out mine", "--out: mine is no folder"), ("plan run.npz --scale 2", "--scale: expected --urdf"),
+    ("evaluate run.npz none", "shard_0000.npz: expected a poke at least, got none"),
+    ("show run.npz none", "shard_0000.npz: expected a poke at least, got none"),
+    ("collect |", "out: expected something, got an empty text"),
+    ("explore --mine |", "mine: expected something, got an empty text")])
+def test_a_place_that_is_no_folder_or_empty_is_named(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").write_text("mine")
+    save_shard(tmp_path / "none" / "shard_0000.npz", tiny_pokes(2)[:0])
+    checkpoints.save_run("run.npz", random_run())
+    assert run(*arguments.replace("|", "").split(" ")) == 2
+    assert re.search(said, capsys.readouterr().err)
+    assert (tmp_path / "mine").read_text() == "mine"
 
 
 # --- numbers that are none of their kind --------------------------------------------------------------------------
@@ -248,6 +276,16 @@ def test_the_losses_refuse_what_numpy_would_let_pass(function, arguments, name):
         function(*arguments)
 
 
+class Series:
+    """An array in another's dress, as pandas has them: with a dtype and a shape, but not NumPy's ways."""
+
+    def __init__(self, value):
+        self.value, self.dtype, self.shape, self.size = value, value.dtype, value.shape, value.size
+
+    def __array__(self, dtype=None, copy=None):
+        return self.value
+
+
 RNG = np.random.default_rng(0)
 BYTES, POINTS = RNG.integers(0, 256, IMAGE.shape, np.uint8), RNG.random(CLOUD.shape)
 SEEN = RNG.random(MASK.shape) < 0.7
@@ -258,7 +296,9 @@ SEEN = RNG.random(MASK.shape) < 0.7
     (losses.distance_maps, (POINTS.tolist(), np.uint16(CLOUD), SEEN.tolist(), SEEN), (POINTS, CLOUD, SEEN, SEEN)),
     (losses.photometric_loss, (BYTES, BYTES[::-1], FLOW, SEEN), (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN)),
     (losses.photometric_loss, ((BYTES / 255).astype(">f8"), (BYTES[::-1] / 255).astype(">f8"), FLOW, SEEN),
-     (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN))], ids=["masks", "lists", "bytes", "byte order"])
+     (BYTES / 255, BYTES[::-1] / 255, FLOW, SEEN)),
+    (losses.distance_maps, (Series(POINTS), CLOUD, Series(SEEN), SEEN), (POINTS, CLOUD, SEEN, SEEN))],
+    ids=["masks", "lists", "bytes", "byte order", "series"])
 def test_the_losses_convert_what_can_be_converted_exactly(function, given, meant):
     expected = function(*meant)
     assert np.max(expected) > 0.01
@@ -281,7 +321,12 @@ def test_a_record_of_pokes_that_stops_everything_later_is_refused_at_once(name, 
     ("train data r.npz --batch 100000000", "batch: .*<= 4096"),
     ("train data r.npz --steps 1000000000000", "steps: .*<= "), ("collect c --jobs 100000", "jobs: .*<= 1024"),
     ("plan run.npz --horizon 1000000", "horizon: .*<= 10"), ("plan run.npz --candidates 10000000", "candidates: .*<="),
-    ("collect c --part 9/8", "part: .*<= 8"),
+    ("collect c --part 9/8", "part: .*<= 8"), ("collect c --part 3", "--part: expected I/N, .*'3'"),
+    ("train data r.npz --width 0", "width: .*>= 1"), ("train data r.npz --masks 0", "masks: .*>= 2"),
+    ("train data r.npz --weight chamfer=x", "--weight: expected TERM=VALUE, .*chamfer, .*'chamfer=x'"),
+    ("train data r.npz --depth-noise 1", "--depth-noise: expected 0 to 0.1 m, got 1"),
+    ("evaluate run.npz data --depth-noise 1", "depth_noise: expected at most 0.1 m, got 1"),
+    ("evaluate run.npz data --pose-error 1 nan", "pose_error: expected at most 1 m, got nan"),
     ("collect c --size 400000 300000", "width: .* to 1280"), ("train data r.npz --width 100000", "width: .*<= 512")])
 def test_a_number_without_bound_is_refused_with_the_largest_that_makes_sense(arguments, said, tmp_path, capsys,
                                                                              monkeypatch):

@@ -136,6 +136,7 @@ print(f"3. Of the arrows on the object, {share:.0%} are within 60 degrees of its
 figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", sharex=True, sharey=True)
 middle = before[0, moving, :2].mean(axis=0) + true_flow[moving, :2].mean(axis=0) / 2
 ends = np.concatenate([before[0, on_object] + each[on_object] for each in (0 * pull, pull / 8, true_flow)])[:, :2]
+ends = ends[np.isfinite(ends).all(axis=1)]  # a gradient that is none is for the checks to tell
 for panel, arrows, title, colour in ((left, pull / 8, "minus the gradient of Eq. (2), an eighth as long", BLUE),
                                      (right, true_flow, "the true scene flow, true to length", RED)):
     panel.scatter(*before[0, counted[0], :2].T, s=14, color="0.7", label="first cloud $P_t$", linewidths=0)

@@ -5,6 +5,7 @@ import os
 import re
 import socket
 import sysconfig
+import zipfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -28,6 +29,14 @@ def data_small():
     return shipped("data_small")
 
 
+def make_folder(path):
+    """Make a folder with those above it, unless it is there. Raises OSError that says what could not be made."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{path}: expected a folder, or a place for one: {error.strerror}") from None
+
+
 @contextmanager
 def whole_file(path, new=False):
     """A temporary path that takes the place of `path` when the block ends well, and vanishes when it does not. new: a
@@ -36,7 +45,7 @@ def whole_file(path, new=False):
     Raises OSError naming `path` where it cannot be written, be it only that the disk is full.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     temporary = path.with_name(f".{this_process()}.{path.name}")  # the ending stays: libraries go by it
     try:
         yield temporary
@@ -60,6 +69,8 @@ def check_output(name, path, ending):
         raise ValueError(f"{name}: expected a name ending in {ending}, got {path.name!r}")
     if path.is_symlink() or path.exists() and not path.is_file():
         raise ValueError(f"{name}: {path} is a link, a folder or a device; expected a plain file or a new name")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise ValueError(f"{name}: {path.parent} is no folder")
 
 
 # --- several processes, perhaps of several machines ----------------------------------------------------------------
@@ -99,7 +110,7 @@ def only_one(path):
     is removed. Raises ValueError naming the lock file where a process is at it.
     """
     path = Path(path).absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     lock = path.with_name(f".{path.name}.lock")
     for _ in range(2):
         try:
@@ -213,6 +224,8 @@ def load_npz(path, format, most=MOST_BYTES):
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
+        if not zipfile.is_zipfile(path):  # of which NumPy says how to unpickle it
+            raise ValueError("no .npz file")
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             check_members(archive.zip, most)
             meta = dict(json.loads(str(archive["meta"])))

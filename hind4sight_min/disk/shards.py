@@ -91,6 +91,8 @@ def parts_of(folder):
     first = None
     for path in shards_in(folder):
         part = load_shard(path)
+        if not len(part):
+            raise ValueError(f"{path}: expected a poke at least, got none")
         first = first or part
         for name in ("camera", "settings", "seed"):
             if part.meta.get(name) != first.meta.get(name):

@@ -3,12 +3,14 @@ a pose that is not quite right corrected by the empty arena's table and walls. N
 and whose pose is known.
 """
 from dataclasses import replace
+from numbers import Real
 
 import numpy as np
 
+from .. import as_arrays
 from ..geometry import rigid, so3_exp, unproject
 from ..training import unsupervised
-from .noise import add_depth_noise, smooth_depth
+from .noise import MOST_NOISE, add_depth_noise, smooth_depth
 
 # --- the faults -------------------------------------------------------------------------------------------------
 
@@ -25,6 +27,7 @@ def lose_depth(depth, rng, camera, missing):
     left or right, as with a projector beside the camera; at least a pixel wide. depth (..., H, W) m, 0 = missing ->
     the same shape and dtype. Raises ValueError for any other kind.
     """
+    depth, = as_arrays("*HW", depth=depth)
     side, lost = rng.choice([-1, 1]), np.zeros(depth.shape, bool)
 
     def beside(offset):
@@ -39,7 +42,7 @@ def lose_depth(depth, rng, camera, missing):
             lost |= np.any([beside(side * k) - depth > STEP for k in pixels(RIM_WIDTH)], axis=0)
         elif kind == "shadow":
             lost |= np.any([depth - beside(-side * k) > STEP for k in pixels(SHADOW_WIDTH)], axis=0)
-        elif isinstance(kind, float) and 0 < kind < 1:
+        elif isinstance(kind, (float, np.floating)) and 0 < kind < 1:
             lost |= rng.random(depth.shape) < kind
         else:
             raise ValueError("missing: expected a share above 0 and below 1, or one of "
@@ -71,13 +74,17 @@ def with_faults(interactions, rng, depth_noise=0.0, missing=(), pitch_error=0.0,
     a shift in any direction, drawn once for all these pokes: a camera stands still. The empty arena is known without
     noise, as a mean of many pictures, but from the same wrong pose. Raises ValueError for what no camera does.
     """
-    degrees, metres = pose_error or (0, 0)
-    for name, value, most in (("pitch_error", pitch_error, 45), ("pose_error", degrees, 45), ("pose_error", metres, 1)):
-        if not abs(value) <= most:
-            raise ValueError(f"{name}: expected at most {most} {'m' if most == 1 else 'degrees'}, got {value}")
+    if np.shape(pose_error) not in ((0,), (2,)):
+        raise ValueError(f"pose_error: expected (degrees, m), got {pose_error}")
+    (degrees, metres), missing = pose_error if len(pose_error) else (0, 0), np.atleast_1d(np.array(missing, object))
+    for name, value, most, unit in (
+            ("depth_noise", depth_noise, MOST_NOISE, "m"), ("pose_error", metres, 1, "m"),
+            ("pitch_error", pitch_error, 45, "degrees"), ("pose_error", degrees, 45, "degrees")):
+        if not (isinstance(value, Real) and abs(value) <= most):
+            raise ValueError(f"{name}: expected at most {most} {unit}, got {value}")
     pictures = np.stack([interactions.depth_before, interactions.depth_after])
     seen = np.stack([add_depth_noise(each, rng, depth_noise) for each in pictures]) if depth_noise else pictures
-    if missing:
+    if len(missing):
         seen = np.where(lose_depth(pictures, rng, interactions.camera, missing) > 0, seen, 0)
     turn, shift = somewhere(rng, np.radians(degrees)), somewhere(rng, metres)
     camera = wrong_pose(interactions.camera, turn + [np.radians(pitch_error), 0, 0], shift)
@@ -96,6 +103,7 @@ def level(camera, empty_depth):
     and a turn about the vertical do not show. The table is the plane that half of the points near z = 0 lie nearest to
     (least trimmed squares): the walls do not bend it. Raises ValueError where too few points are near z = 0.
     """
+    empty_depth, = as_arrays("HW", empty_depth=empty_depth)
     points = unproject(empty_depth.astype(float), camera)[empty_depth > 0]
     near = points[np.abs(points[:, 2]) < TABLE[0]]
     if len(near) < TABLE[1] * empty_depth.size:

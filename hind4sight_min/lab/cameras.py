@@ -111,7 +111,7 @@ def metres_of(name, counts, unit):
 
 # --- the pose -----------------------------------------------------------------------------------------------------
 
-LEAST_TABLE = 0.25  # of the empty picture's points
+LEAST_TABLE = 0.25  # of the empty picture's points, and they of its pixels
 
 
 def rigid_pose(matrix):
@@ -155,6 +155,10 @@ def table_pose(empty_depth, matrix, ray):
     z is the table's normal, x the camera's right, the origin where the ray (3,), camera axes, meets the table.
     empty_depth (H, W) m; matrix (3, 3): its intrinsics. Raises ValueError where no table is found there.
     """
+    seen = np.mean(empty_depth > 0)
+    if seen < LEAST_TABLE:  # few points lie in a plane wherever they are
+        raise ValueError(f"{EMPTY}.png: expected depth in {LEAST_TABLE:.0%} of it to find the table, got {seen:.0%}; "
+                         "give arena_from_camera")
     camera = Camera(*empty_depth.shape[::-1], matrix[0, 0], matrix[1, 1], *matrix[:2, 2], np.eye(4))
     normal, middle, share = fit_plane(unproject(empty_depth.astype(float), camera)[empty_depth > 0],
                                       np.random.default_rng(0))

@@ -24,7 +24,7 @@ from ..sim.photographs import photographs
 from ..sim.truth import find_truth
 from . import cameras, contact, control, evaluation, tables
 from .camera_faults import ONE_SIDED, under_faults
-from .noise import under_noise
+from .noise import MOST_NOISE, under_noise
 from .processes import parallel_map
 from .runs import total, train_saving
 
@@ -137,9 +137,12 @@ def new_run(interactions, weight=(), masks=None, width=None, depth_noise=0.0, ca
     """A fresh Run as the options of `train` say; with start_from, a path, from the parameters of that checkpoint."""
     if depth_noise and camera_faults:
         raise ValueError("--depth-noise: --camera-faults has a noise of its own")
+    if not 0 <= depth_noise <= MOST_NOISE:
+        raise ValueError(f"--depth-noise: expected 0 to {MOST_NOISE} m, got {depth_noise}")
     start = start_from and checkpoints.load_run(start_from)
     sizes = start.recipe.sizes if start else Sizes()
-    asked = replace(sizes, masks=masks or sizes.masks, width=width or sizes.width)
+    given_sizes = {name: value for name, value in (("masks", masks), ("width", width)) if value is not None}
+    asked = replace(sizes, **given_sizes)
     if start and asked != sizes:
         raise ValueError(f"--start-from: {start_from} has {sizes.masks} masks and a width of {sizes.width}, expected "
                          f"{asked.masks} and {asked.width}")
@@ -255,7 +258,8 @@ def run_reproduce(args):
                                       progress_line("poke"))
             print(contact.contact_table(found))
         elif args.table == "planning":
-            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map)
+            found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map,
+                                                             args.planners)
             print(tables.planning_table(found))
             figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
         else:
@@ -277,7 +281,9 @@ def run_plan(args):
     if args.mark:
         options["chamfer_weight"] = 0.0  # there is no goal picture to compare with
     search, path = planning.Search(**options), Path(args.out) / "plan.gif"
-    settings = replace(control.settings_for(run), **drawn_from(args)) if args.urdf else control.settings_for(run)
+    drawn, settings = drawn_from(args), control.settings_for(run)
+    settings = replace(settings, **drawn) if args.urdf else settings
+    check_output("--out", path, ".gif")
     with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
@@ -290,8 +296,8 @@ def run_plan(args):
     figures.save_sequence(path, record, task.arena.camera)
     print(f"  stopped: {record['stopped']}")
     print(f"{path}: {len(distance) - 1} pokes, {100 * distance[0]:.1f} -> {100 * distance[-1]:.1f} cm from the goals")
-    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_distance_left": float(distance[-1] / distance[0]),
-                           "plan_stopped": record["stopped"]})
+    write_json(args.json, {"plan_pokes": len(distance) - 1, "plan_stopped": record["stopped"],
+                           "plan_distance_left": float(distance[-1] / (distance[0] or 1))})  # of a goal that is met, 0
 
 
 # --- the demo ----------------------------------------------------------------------------------------------
@@ -354,11 +360,13 @@ def run_grade(args):
 # --- the command line -----------------------------------------------------------------------------------------
 
 def term_weight(text):
-    """'photometric=0.5' -> ('photometric', 0.5). Raises ValueError for anything else; argparse then says so."""
-    name, value = text.split("=")
-    if name not in training.WEIGHTS:
-        raise ValueError
-    return name, float(value)
+    """'photometric=0.5' -> ('photometric', 0.5). Raises argparse's error for anything else."""
+    name, _, value = text.partition("=")
+    try:
+        return {name: (name, float(value)) for name in training.WEIGHTS}[name]
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"expected TERM=VALUE, a term of {', '.join(training.WEIGHTS)} and a number, "
+                                         f"got {text!r}") from None
 
 
 def missing_kind(text):
@@ -370,8 +378,11 @@ def missing_kind(text):
 
 
 def part_of(text):
-    """'3/8' -> (3, 8). Raises ValueError for anything else; argparse then says so."""
-    which, parts = map(int, text.split("/"))
+    """'3/8' -> (3, 8). Raises argparse's error for anything else."""
+    try:
+        which, parts = map(int, text.split("/"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected I/N, two whole numbers, got {text!r}") from None
     return which, parts
 
 
@@ -484,6 +495,8 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                   "help": "all: the tables of Sec. IV-D to IV-F; planning: the control experiment of Sec. IV-G; "
                   "contact: a model's error by what met what, in minutes"},
         "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with"},
+        "--planners": {"nargs": "+", "choices": list(tables.PLANNERS), "default": list(tables.PLANNERS),
+                       "help": "of planning: which; all of them take hours"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
         "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),
@@ -544,13 +557,16 @@ def main(arguments=None):
         parser.print_help()
         return 0
     try:
+        for name, value in vars(args).items():
+            if value == "" or isinstance(value, list) and "" in value:  # an unset variable of the shell's
+                raise ValueError(f"{name}: expected something, got an empty text")
         if getattr(args, "json", None):
             check_output("--json", args.json, ".json")
         args.function(args)
     except BrokenPipeError:
         raise
     except (ValueError, RuntimeError, OSError, FloatingPointError) as error:
-        print(f"hind4sight {args.command}: {error}", file=sys.stderr)
+        print(f"hind4sight {args.command}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"\nhind4sight {args.command}: stopped; what is on disk is whole{GO_ON.get(args.command, '')}",

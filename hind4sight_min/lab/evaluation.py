@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from .. import losses
+from .. import check_whole, losses
 from ..geometry import Camera, optical_flow, unproject
 from ..interactions import cell_centres
 from ..networks import Prediction, inverse_model, predict, softmax
@@ -42,6 +42,7 @@ def ask(run, interactions, row, **faults):
     arena.
     """
     check_camera(interactions.camera, Camera(**run.meta["camera"]))
+    check_whole("row", row, -len(interactions), len(interactions) - 1)
     one = interactions[[row]]
     if any(faults.values()) or run.meta.get("camera_faults"):
         one = prepared(with_faults(one, np.random.default_rng([0, row]), **faults))
@@ -155,6 +156,8 @@ def evaluate(run, interactions, truth=None, progress=None, **faults):
     progress(done, total) is called after every poke.
     """
     pokes = []
+    if not len(interactions):
+        raise ValueError("interactions: expected a poke at least, got none")
     for row in range(len(interactions)):
         pokes.append(label_free_errors(run, interactions, row, **faults) if truth is None else
                      errors_of_poke(run, interactions, truth, row, **faults))

@@ -51,6 +51,7 @@ class Explorer:
         if yours:
             figure.text(0.99, 0.022, f"yours: {', '.join(yours)}", ha="right", color=figures.TRUE)
         self.rng, self.saved, self.frames, self.held, self.marking = np.random.default_rng(0), 0, None, None, False
+        self.refused = None  # the last line that said what cannot be
         if self.canvas.manager:  # Matplotlib's own keys mean something else
             self.canvas.mpl_disconnect(self.canvas.manager.key_press_handler_id)
         for name, action in (("draw", self._drawn), ("button_press", partial(self.attempt, self._press)),
@@ -143,10 +144,11 @@ class Explorer:
         """Do it and draw. What cannot be is said in a line, as is what is wrong with a student's code."""
         try:
             action(*given)
-        except Exception as error:
-            if not (self.yours or isinstance(error, ValueError)):
+        except (Exception, SystemExit) as error:
+            if not (self.yours or isinstance(error, (ValueError, OSError))):
                 raise
-            self.say(described(error) if self.yours else str(error))
+            self.refused = described(error) if self.yours else str(error)
+            self.say(self.refused)
         self.paint()
 
     def _press(self, event):
@@ -277,6 +279,9 @@ def direction(pokes):
 
 # --- the command, and a script in place of the mouse --------------------------------------------------------------
 
+LONGEST = 60  # s, that a film waits
+
+
 def play(explorer, lines):
     """Do what the lines of a script say, by the events that mouse and keys make.
 
@@ -293,16 +298,21 @@ def play(explorer, lines):
                 events, times = [KeyEvent("key_press_event", canvas, key)], 8
             elif word == "wait":
                 seconds, = map(float, rest)
+                if not 0 <= seconds <= LONGEST:
+                    raise ValueError
                 if explorer.frames:
                     explorer.frames += explorer.frames[-1:] * round(10 * seconds)
             else:
                 corners = np.reshape([float(each) for each in rest], (-1, 2))
+                if not (len(corners) and np.abs(corners).max() < 1e6):
+                    raise ValueError
                 way = np.linspace(corners[:-1], corners[1:], 8, endpoint=False).swapaxes(0, 1).reshape(-1, 2)
                 names = ["button_press_event", *(len(way) - 1) * ["motion_notify_event"], "button_release_event"]
                 events = [MouseEvent(name, canvas, *camera.transform(place), {"drag": 1, "goal": 3}[word])
                           for name, place in zip(names, [*way, corners[-1]], strict=True)]
         except (KeyError, ValueError):
-            raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, "
+            raise ValueError(f"script, line {number}: expected drag or goal X Y X Y, key K, or wait SECONDS, 0 to "
+                             f"{LONGEST}, "
                              f"got {line.strip()!r}") from None
         filmed = len(explorer.frames or ())
         for event in events:
@@ -318,14 +328,20 @@ def explore(checkpoint=None, data=None, seed=0, mine=(), out=".", figure=None):
     minds the mouse. Raises RuntimeError where it can do neither.
     """
     run = load_run(checkpoint or data_small() / "checkpoint.npz")
-    yours = [name for folder in mine or () for name in take_written(folder)]
+    world = world_of(run, data, seed)
     if figure is None:
         import matplotlib.pyplot as plt
         with rc_context({"toolbar": "None"}):
             figure = plt.figure("hind4sight explore", figsize=SIZE)
         if plt.get_backend().lower() == "agg":
             raise RuntimeError("no window can be opened here; --script FILE and --demo OUT.gif need none")
-    return Explorer(figure, world_of(run, data, seed), run, out, yours)
+    try:
+        yours = [name for folder in mine or () for name in take_written(folder)]
+        return Explorer(figure, world, run, out, yours)
+    except (Exception, SystemExit) as error:
+        if not mine or described(error) == f"ValueError: {error}":  # not the student's
+            raise
+        raise ValueError(f"mine: {described(error)}") from None
 
 
 def run_explore(args):
@@ -343,3 +359,5 @@ def run_explore(args):
     if args.demo:
         figures.save_film(args.demo, explorer.frames, 0.1)
         print(f"{args.demo}: {len(explorer.frames) / 10:.0f} s")
+    if args.script and explorer.refused:  # nobody may have been looking
+        raise ValueError(f"script: {explorer.refused}")

@@ -11,6 +11,9 @@ from ..disk.shards import DEPTH_UNIT
 from ..training import unsupervised
 
 
+MOST_NOISE = 0.1  # m, that anybody's pokes are seen with: more leaves no table
+
+
 def add_depth_noise(depth, rng, standard_deviation=0.01):
     """Gaussian depth noise that grows with depth. Paper: Sec. IV-B, "SD of 1 cm, scaled by the depth".
 
@@ -22,7 +25,7 @@ def add_depth_noise(depth, rng, standard_deviation=0.01):
     check_number("standard_deviation", standard_deviation, least=0, most=10)
     valid = depth > 0
     pictures = depth.reshape(-1, *depth.shape[-2:])
-    median = np.array([np.median(each[each > 0]) if each.any() else 1.0 for each in pictures], depth.dtype)
+    median = np.array([np.median(each[each > 0]) if (each > 0).any() else 1.0 for each in pictures], depth.dtype)
     scale = standard_deviation / median.reshape(depth.shape[:-2] + (1, 1))
     noisy = depth * (1 + scale * rng.standard_normal(depth.shape))
     return np.where(valid, np.maximum(noisy, DEPTH_UNIT), 0).astype(depth.dtype)

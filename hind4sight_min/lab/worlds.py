@@ -3,6 +3,7 @@ from importlib.util import find_spec
 
 import numpy as np
 
+from .. import check_whole
 from ..disk.files import data_small
 from ..disk.shards import load_interactions
 from ..planning import NoPoke
@@ -120,6 +121,7 @@ class Recorded:
 
 def world_of(run, data, seed):
     """The pokes of the folder `data`; of None the simulator, or the shipped pokes where pybullet is not installed."""
+    check_whole("seed", seed, 0)
     if data is None and find_spec("pybullet"):
         return Simulated(settings_for(run), seed)
     data = data or data_small() / "test"

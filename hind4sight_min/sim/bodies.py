@@ -211,6 +211,12 @@ def files_named(path):
     return sorted(glob.glob(path)) or there or [path]
 
 
+def floored(number):
+    """A number above 0 with two digits, not above it."""
+    unit = 10.0 ** (np.floor(np.log10(number)) - 1)
+    return np.floor(number / unit) * unit
+
+
 def read_urdfs(paths, scale=1.0):
     """URDF files, or patterns for them -> a tuple of Urdf, for `Settings.own`. Each is loaded: can it be poked?
 
@@ -235,7 +241,7 @@ def read_urdfs(paths, scale=1.0):
             least = min(least, getattr(error, "room", 1))
     bullet.disconnect()
     if wrong:
-        hint = f"; none is too large at a scale of {np.floor(100 * scale * least) / 100:g}" if least < 1 else ""
+        hint = f"; none is too large at a scale of {floored(scale * least):g}" if least < 1 else ""
         count = f" ({len(wrong)} of {len(files)} files cannot be used)" if len(files) > 1 else ""
         raise ValueError(wrong[0] + count + hint)
     return tuple(found)

@@ -97,8 +97,13 @@ def collect(folder, pokes, seed, settings=Settings(), map=map, progress=None, pa
             del jobs_of_part[path]
     claim(folder / "collection.json", made_of)
     clear_away(folder.iterdir())
-    for made in map(partial(_collect_file, settings, seed), jobs_of_part, jobs_of_part.values()):
-        counts.update(made)
-        if progress:
-            progress(counts["kept"], total)
+    try:
+        for made in map(partial(_collect_file, settings, seed), jobs_of_part, jobs_of_part.values()):
+            counts.update(made)
+            if progress:
+                progress(counts["kept"], total)
+    except ValueError:  # such scenes cannot be: others shall have the folder
+        if not find_shards(folder):
+            (folder / "collection.json").unlink(missing_ok=True)
+        raise
     return dict(counts)
