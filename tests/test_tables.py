@@ -264,6 +264,6 @@ def test_summary_of_the_control_experiment_by_hand():
         assert figures[name] == pytest.approx(value), name
     assert "20\u00b0 -> 8\u00b0" in tables.planning_table(figures)
     alone, _ = tables.summarise_planning({key: each for key, each in found.items() if key[0] in ("learned", "greedy")})
-    kept = "learned", "greedy", "plan_worst"
-    assert alone == {name: value for name, value in figures.items() if name.startswith(kept)}
+    parts = "learned", "greedy", "plan_worst"
+    assert alone == {name: value for name, value in figures.items() if name.startswith(parts)}
     assert tables.planning_table(alone).count("\n") == 2, "a row for a planner that was not run"
