@@ -286,7 +286,7 @@ def house():
     course, of_course = lines("hind4sight_min/course/**/*.py"), lines("tests/*course*.py", "tests/test_grading.py")
     return {"core_lines": lines("hind4sight_min/[!_]*.py"), "course_lines": course,
             "hero_mb": (ROOT / "docs" / "hero.gif").stat().st_size / 1e6,
-            "explorer_lines": lines("hind4sight_min/lab/explore.py"),
+            "explorer_lines": lines(*(f"hind4sight_min/lab/{name}.py" for name in ("explore", "scripts", "worlds"))),
             "package_lines": lines("hind4sight_min/**/*.py") - course, "test_lines": lines("tests/*.py") - of_course}
 
 
