@@ -307,7 +307,7 @@ FEW = np.uint16(np.arange(HEIGHT) < 10)[:, None]  # rows, of which any plane has
     (entry(width=640), "empty_depth.png: expected 640 x 240"),
     (picture("empty_depth", DEPTH.astype(np.uint8)), "empty_depth.png: .*16 bits, grey, got .*8 bits, grey"),
     (lambda folder: (entry(arena_from_camera=None)(folder), picture("empty_depth", DEPTH * FEW)(folder)),
-     "empty_depth.png: expected depth in 25% of it to find the table, got 4%; give arena_from_camera"),
+     "empty_depth.png: expected depth in 25% of it to find the table, got 3%; give arena_from_camera"),
     (picture("0_before", DEPTH), "0_before.png: expected .*8 bits, colour, got .*16 bits, grey"),
     (picture("0_after_depth", 0 * DEPTH), "0_after_depth.png: expected depths"),
     (picture("0_after_depth", DEPTH * np.eye(WIDTH, dtype=np.uint16)[:HEIGHT]), "0_after_depth.png: .* depth in 50%"),
