@@ -257,7 +257,7 @@ def test_the_demo_without_pybullet_takes_the_shipped_pokes_and_says_so_once(shor
     ("train pokes out.npz --steps -1", ["steps", "-1"]), ("train pokes out.npz --batch 0", ["batch"]),
     ("train pokes out.npz --masks 1", ["masks"]), ("train pokes out.npz --jobs 0", ["jobs"]),
     ("train pokes out.npz --optimiser sgd", ["optimiser", "sgd"]),
-    ("train pokes out.npz --depth-noise -1 --jobs 1", ["standard_deviation", "-1"]),
+    ("train pokes out.npz --depth-noise -1 --jobs 1", ["--depth-noise", "-1"]),
     ("train pokes out.npz --weight chamfer=-1", ["weights"]),
     ("train pokes pokes/shard_0000.npz/out.npz --steps 1 --batch 1 --width 8 --jobs 1", ["shard_0000.npz"]),
     ("train pokes out.npz --resume", ["out.npz", "no such file"]), ("train pokes", ["out", ".npz"]),
