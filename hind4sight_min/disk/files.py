@@ -8,6 +8,7 @@ import sysconfig
 import zipfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def whole_file(path, new=False):
     """
     path = Path(path)
     make_folder(path.parent)
-    temporary = path.with_name(f".{this_process()}.{path.name}")  # the ending stays: libraries go by it
+    temporary = path.with_name(f".{this_process()}.{get_ident()}.{path.name}")  # the ending stays: libraries go by it
     try:
         yield temporary
         if new:
