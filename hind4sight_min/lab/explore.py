@@ -19,7 +19,7 @@ from ..geometry import Camera, optical_flow, project, rigid
 from ..interactions import occupied_grid
 from ..losses import chamfer_loss, distance_maps, seen_in_both
 from ..networks import predict
-from ..planning import Search, first_start, goal_of, learned_step, plan, possible_starts, roll, view_of
+from ..planning import SLACK, Search, first_start, goal_of, learned_step, plan, possible_starts, roll, view_of
 from ..scene import scene_of
 from . import figures
 from .cameras import check_camera
@@ -118,8 +118,8 @@ class Explorer:
         grid = occupied_grid(self.view.cloud[None], self.view.occupied, self.settings)
         start = first_start(possible_starts(self.poke[None], grid, self.settings))[0]
         self.draw_poke(start)
-        self.say(f"A poke to ({self.poke[0]:.2f}, {self.poke[1]:.2f}) m, {np.degrees(self.poke[2]):.0f}\u00b0. " + (
-            "Space carries it out." if np.isfinite(start).all() else "No room for the finger: a guess at most."))
+        self.say(f"A poke to ({self.poke[0]:.2f}, {self.poke[1]:.2f}) m at {np.degrees(self.poke[2]):.0f}\u00b0. " + (
+            "Space carries it out." if np.isfinite(start).all() else "No room for the finger: a mere guess."))
 
     def draw_poke(self, start):
         """Draw the poke from its start (2,) m, pale if that is NaN, and the marked points with where they shall go."""
@@ -225,7 +225,7 @@ class Explorer:
         maps, still = (distance_maps(each, after.points, kept, next_kept) for each in (predicted, points))
         self.art.images["truth"].set_data(after.images[0])
         self.art.images["distance"].set_data(100 * np.sqrt(maps[0]).reshape(scene.images.shape[1:3]))
-        said = (f"Chamfer distance (Eq. 2): {1e4 * chamfer_loss(*maps)[0]:.0f} cm\u00b2, had nothing moved "
+        said = (f"Chamfer distance (Eq. 2), a sum: {1e4 * chamfer_loss(*maps)[0]:.0f} cm\u00b2; of no motion "
                 f"{1e4 * chamfer_loss(*still)[0]:.0f}.")
         if true is not None:
             self.art.true.set_segments(figures.scene_flow_lines(points[0], true, scene.valid[0]))
@@ -239,7 +239,7 @@ class Explorer:
             left = at_height(goals, self.view.marks[:, 2], self.camera) - self.view.marks[:, :2]
             said = f"{100 * np.linalg.norm(left, axis=1).mean():.1f} cm to go. {said}"
         self.draw_poke(start)
-        self.say(said if asked is self.poke else f"The recorded poke, without a simulator. {said}")
+        self.say(said if asked is self.poke else f"Recorded, no simulator. {said}")
         self.canvas.draw()
 
     def plan(self):
@@ -256,14 +256,14 @@ class Explorer:
             self.art.others.set_segments(lines[search.elites:])
             self.art.arrows[0].set_alpha(0)
             self.say(f"CEM, round {iteration + 1} of {search.iterations}: the model is asked about {len(pokes)} pokes. "
-                     f"Around the best {search.elites}, yellow, the next are drawn. Lowest cost {costs.min():.2f}.")
+                     f"Around the best {search.elites}, yellow, the next are drawn. Lowest cost {costs.min():.2f} cm.")
             self.paint()
             self.canvas.flush_events()
         rollout = partial(roll, learned_step(self.run, self.view), self.view, settings=self.settings)
         found = plan(rollout, self.view, goal_of(self.goals), self.camera, self.settings, search, self.rng, show)
         self.poke = found.pokes[0]
         self.ask()
-        self.say(f"Planned: the cost is {found.now:.2f}, after this poke {found.cost:.2f}, says the model.")
+        self.say(f"Plan: cost {found.now:.2f}, after this poke {found.cost:.2f} (cm beyond {100 * SLACK}, predicted).")
 
     def save(self):
         """Save the figure as a picture."""

@@ -344,11 +344,11 @@ def training_figure(log, no_motion={}):
 
 EXPLORER = [["camera", "camera", "masks", "above"], ["camera", "camera", "flow", "above"],
             ["seen", "predicted", "truth", "distance"]]
-TITLES = {"camera": "Click where the finger shall stop, drag the way it pushes",
-          "masks": "Masks: what moves as one", "flow": "Optical flow: where each pixel goes",
+TITLES = {"camera": "Now: click where the finger shall stop, drag the way it pushes",
+          "masks": "Masks: what moves as one; grey stays", "flow": "Optical flow: where pixels go; white stays",
           "above": "Scene flow: where the points go, from above", "seen": "What the model sees: {} x {} pixels",
-          "predicted": "Predicted: these pixels, warped along the flow", "truth": "What really happened, after poke!",
-          "distance": "From predicted points to seen ones (Eq. 2)"}
+          "predicted": "Predicted: these pixels, warped by optical flow", "truth": "What really happened, after poke!",
+          "distance": "Predicted to nearest seen point, in cm (Eq. 2)"}
 SHOWN = 0.08  # m; so much flow has the full colour
 BLANK = "0.93"  # grey
 
@@ -369,7 +369,7 @@ def explorer_panels(figure, camera, settings, buttons):
         axes[name].set_title(title.format(width, height), fontsize=9.5)
         axes[name].spines[:].set_visible(name == "above")
     bar = axes["distance"].inset_axes((0.1, -0.09, 0.6, 0.05))
-    figure.colorbar(images["distance"], cax=bar, orientation="horizontal").set_label("cm", loc="right")
+    figure.colorbar(images["distance"], cax=bar, orientation="horizontal")
     above, view = axes["above"], axes["camera"]
     above.set(aspect="equal", anchor="N", xlim=(-half, half), ylim=(-half, half), **ARENA)
     above.yaxis.tick_right()
@@ -377,8 +377,8 @@ def explorer_panels(figure, camera, settings, buttons):
     wheel = above.inset_axes((0.76, -0.38, 0.22, 0.22))
     wheel.imshow(colour_wheel(96))
     wheel.axis("off")
-    above.text(0.74, -0.35, f"optical flow, rim: {SHOWN / camera.pixel_size:.0f} px", fontsize=8.5, ha="right",
-               transform=above.transAxes)
+    above.text(0.74, -0.35, f"optical flow's colours, rim: {SHOWN / camera.pixel_size:.0f} px", fontsize=8.5,
+               ha="right", transform=above.transAxes)
 
     def lines(axes, colour, width, label=None):
         axes.plot([], [], color=colour, label=label)
