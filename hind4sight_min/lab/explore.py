@@ -118,7 +118,8 @@ class Explorer:
         grid = occupied_grid(self.view.cloud[None], self.view.occupied, self.settings)
         start = first_start(possible_starts(self.poke[None], grid, self.settings))[0]
         self.draw_poke(start)
-        self.say(f"A poke to ({self.poke[0]:.2f}, {self.poke[1]:.2f}) m at {np.degrees(self.poke[2]):.0f}\u00b0. " + (
+        x, y = np.round(self.poke[:2], 2) + 0.0  # no -0.00
+        self.say(f"A poke to ({x:.2f}, {y:.2f}) m at {np.degrees(self.poke[2]):.0f}\u00b0. " + (
             "Space carries it out." if np.isfinite(start).all() else "No room for the finger: a mere guess."))
 
     def draw_poke(self, start):
