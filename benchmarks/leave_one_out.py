@@ -52,9 +52,8 @@ VARIANTS = {
     "K = 4": ([("networks.py", "masks: int = 3", "masks: int = 4")], {}, 0.0),
     "full, 1 cm noise": ([], {}, 0.01),
     "1 cm noise, depth not smoothed": (
-        [("lab/noise.py", "smooth_depth(add_depth_noise(getattr(interactions, f\"depth_{name}\"), rng, "
-          "standard_deviation),", "(lambda depth, *_: depth)(add_depth_noise(getattr(interactions, f\"depth_{name}\"), "
-          "rng, standard_deviation),")], {}, 0.01),
+        [("lab/noise.py", "smooth_depth(depth, interactions", "(lambda depth, *_: depth)(depth, interactions")],
+        {}, 0.01),
 }
 
 WORK = """

@@ -151,8 +151,8 @@ PLANTED = (
     ("lab/noise.py", "noise", [
         ("one noise for all pictures", "rng.standard_normal(depth.shape)", "rng.standard_normal(depth.shape[-2:])"),
         ("the same noise before and after, at every step",
-         'add_depth_noise(getattr(interactions, f"depth_{name}"), rng, standard_deviation)',
-         'add_depth_noise(getattr(interactions, f"depth_{name}"), np.random.default_rng(0), standard_deviation)')]),
+         'add_depth_noise(depth, rng, standard_deviation)',
+         'add_depth_noise(depth, np.random.default_rng(0), standard_deviation)')]),
     ("lab/se3nets.py", "se3nets", [
         ("the truth of other rows", "self.truth[rows]", "self.truth[np.sort(rows)]"),
         ("the motion of noisy points for the true ones", "unproject(data.interactions.depth_before, data.camera)",

@@ -10,7 +10,7 @@ import numpy as np
 from .. import as_arrays
 from ..geometry import rigid, so3_exp, unproject
 from ..training import unsupervised
-from .noise import MOST_NOISE, add_depth_noise, smooth_depth
+from .noise import MOST_NOISE, add_depth_noise, smoothed
 
 # --- the faults -------------------------------------------------------------------------------------------------
 
@@ -159,9 +159,7 @@ def prepared(interactions):
     camera = level(interactions.camera, empty)
     if settings.get("wall_height"):
         camera = along_walls(camera, empty, settings)
-    seen = {f"depth_{name}": smooth_depth(getattr(interactions, f"depth_{name}"), empty,
-                                          getattr(interactions, f"rgb_{name}"), interactions.camera)
-            for name in ("before", "after")}
+    seen = smoothed(interactions, interactions.depth_before, interactions.depth_after)
     return replace(interactions, **seen, camera=camera)
 
 

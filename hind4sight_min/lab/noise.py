@@ -56,10 +56,16 @@ def with_depth_noise(interactions, standard_deviation, rng):
 
     A record in, a record out; the empty arena is known without noise. standard_deviation: in m.
     """
-    seen = {name: smooth_depth(add_depth_noise(getattr(interactions, f"depth_{name}"), rng, standard_deviation),
-                               interactions.empty_depth, getattr(interactions, f"rgb_{name}"), interactions.camera)
-            for name in ("before", "after")}
-    return replace(interactions, depth_before=seen["before"], depth_after=seen["after"])
+    noisy = [add_depth_noise(depth, rng, standard_deviation)
+             for depth in (interactions.depth_before, interactions.depth_after)]
+    return replace(interactions, **smoothed(interactions, *noisy))
+
+
+def smoothed(interactions, depth_before, depth_after):
+    """Depth pictures (M, H, W) m of these pokes with the noise taken out and holes filled, by name: a dict."""
+    return {f"depth_{name}": smooth_depth(depth, interactions.empty_depth, getattr(interactions, f"rgb_{name}"),
+                                          interactions.camera)
+            for name, depth in (("before", depth_before), ("after", depth_after))}
 
 
 SMOOTHING = 0.027, 0.15, 0.02  # what counts as near: radius and SD in m on the table, SDs of colours in [0, 1], in m
