@@ -52,6 +52,20 @@ def kept(run):
                    meta={**run.meta, "log": [*run.meta["log"]], "sums": dict(run.meta["sums"])})
 
 
+def begin(run, data, path, objective):
+    """Note in run.meta which data set the run is of and what its terms are without motion, unless it has them.
+
+    path: of the checkpoint, for the message. Raises ValueError for another data set than the run began with and for a
+    camera that does not show the arena.
+    """
+    data_stamp = plain(stamp(getattr(data, "interactions", data)))  # SE3-Nets has its own around them
+    check_same_data(path, run.meta.get("data"), data_stamp)
+    check_camera(data.camera)
+    run.meta["data"] = data_stamp
+    if "no_motion" not in run.meta:
+        run.meta["no_motion"] = no_motion(data, run.recipe, objective)
+
+
 def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, on_epoch=None, save_every=60.0):
     """`train` with a log, and a checkpoint at `path` every `save_every` seconds and at its end, however it ends, unless
     it diverged -> the log.
@@ -67,10 +81,7 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
     first, recipe, meta, per_epoch = run.step, run.recipe, run.meta, max(1, len(data) // run.recipe.batch)
     log, sums, before = meta.setdefault("log", []), meta.setdefault("sums", {}), meta.get("seconds", 0.0)
     began = saved = time.perf_counter()
-    data_stamp = plain(stamp(getattr(data, "interactions", data)))  # SE3-Nets has its own around them
-    check_same_data(path, meta.get("data"), data_stamp)
-    check_camera(data.camera)
-    meta["data"] = data_stamp
+    begin(run, data, path, objective)
 
     def save():
         nonlocal saved
@@ -93,8 +104,6 @@ def train_saving(data, run, path, objective=unsupervised, jobs=1, on_step=None, 
         if time.perf_counter() - saved > save_every:
             save()
 
-    if "no_motion" not in meta:
-        meta["no_motion"] = no_motion(data, recipe, objective)
     with only_one(path), parallel_map(min(jobs, -(-recipe.batch // CHUNK))) as map, np.errstate(all="ignore"):
         try:
             train(data, run, objective, map, step_done)
