@@ -81,8 +81,7 @@ class Interactions:
 
 def grid_shape(settings):
     """(rows, columns) of the arena's grid of cells; rows run along y, columns along x."""
-    cells = int(round(settings["arena"] / settings["cell"]))
-    return cells, cells
+    return (round(settings["arena"] / settings["cell"]),) * 2
 
 
 def cells_of(xy, settings):

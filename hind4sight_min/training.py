@@ -208,8 +208,7 @@ def rows_of_step(recipe, count, step):
 
     Every epoch is a permutation of the rows; a batch may straddle two epochs.
     """
-    first = step * recipe.batch
-    rows = []
+    first, rows = step * recipe.batch, []
     for epoch in range(first // count, (first + recipe.batch - 1) // count + 1):
         order = np.random.default_rng([recipe.seed, 1, epoch]).permutation(count)
         rows.append(order[max(first - epoch * count, 0):first + recipe.batch - epoch * count])

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("pybullet")
 
 from scipy.spatial.transform import Rotation
-from test_planning import CAMERA, island
+from test_planning import CAMERA, goal_at, island, shift_along
 from tiny import SETTINGS
 
 from hind4sight_min import planning
@@ -243,22 +243,51 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
         control.closed_loop(task, run, "learned", SMALL, budget=5)
 
 
-@pytest.mark.parametrize("now, gains, made, said", [
-    (1.0, {1: 0.9}, 0, "no poke would help, the model says; what is left costs 1.00"), (1.0, {1: 1.1}, 1, "budget"),
-    (5.0, {1: 0.9, 2: 0.9}, 0, "no 2 pokes in a row would help, the model says; what is left costs 5.00"),
-    (5.0, {1: 0.9, 2: 1.1}, 1, "budget"), (5.0, {1: 1.1}, 1, "budget")])
-def test_where_one_poke_hardly_helps_it_looks_two_ahead_if_the_goal_is_far_and_says_why_it_ends(
-        now, gains, made, said, task, run, pokes, monkeypatch):
+@pytest.mark.parametrize("now, costs, lowest, rest, asked, pokes", [
+    (1.9, {1: 1.8}, np.inf, 0, [(1, 0)], 1),  # near the goal one is enough
+    (5.0, {1: 4.4}, np.inf, 0, [(1, 0)], 1),  # it brings more than a tenth
+    (5.0, {1: 4.6, 3: 2.0}, np.inf, 0, [(1, 0), (3, 0)], 3),
+    (5.0, {1: 4.6, 3: 4.0}, np.inf, 0, [(1, 0), (3, 0)], 1),  # three bring less each
+    (5.0, {1: 4.4, 3: 2.0}, 4.5, 0, [(1, 0), (3, 0)], 3),  # it only takes back what the last poke did
+    (5.0, {1: 4.6, 3: None}, np.inf, 0, [(1, 0), (3, 0)], 1),  # no room, so far ahead
+    (5.0, {2: 4.0}, np.inf, 2, [(2, 2)], 2),  # the rest of a plan
+    (5.0, {2: 4.8, 3: 2.0}, np.inf, 2, [(2, 2), (3, 0)], 3)])
+def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now, costs, lowest, rest, asked, pokes):
+    calls = []
+
+    def ask(search, rest):
+        calls.append((search.horizon, len(rest)))
+        if costs[search.horizon] is None:
+            raise planning.NoPoke("no room")
+        return Plan(np.zeros((search.horizon, 3)), costs[search.horizon], now)
+    assert len(control.choose_plan(ask, SMALL, np.zeros((rest, 3)), lowest).pokes) == pokes
+    assert calls == asked
+
+
+@pytest.mark.parametrize("now, said", [(1.0, "no poke would help, the model says; what is left costs 1.00"), (
+    5.0, "no poke would help, nor 3 in a row, the model says; what is left costs 5.00")])
+def test_a_plan_is_followed_and_why_it_ends_is_said(now, said, task, run, pokes, monkeypatch):
     asked = []
 
-    def next_plan(*given):
-        asked.append(given[-2])  # the Search
-        return Plan(pokes[:asked[-1].horizon], now - gains[asked[-1].horizon] * control.GAIN, now)
-    monkeypatch.setattr(control, "next_plan", next_plan)
-    record = control.closed_loop(task, run, "learned", SMALL, budget=1)
-    np.testing.assert_array_equal(record["pokes"], pokes[:made])
-    assert [(search.horizon, search.candidates) for search in asked] == [(1, 16), (2, 32)][:len(gains)]
-    assert said in record["stopped"]
+    def choose_plan(ask, search, rest, lowest):
+        asked.append((len(rest), lowest))
+        return Plan(pokes, (0, now)[len(asked) // 2], now)
+    monkeypatch.setattr(control, "choose_plan", choose_plan)
+    record = control.closed_loop(task, run, "learned", SMALL, budget=5)
+    np.testing.assert_array_equal(record["pokes"], pokes[:1])
+    assert asked == [(0, np.inf), (1, now)] and record["stopped"] == said
+
+
+def test_sequences_are_drawn_poke_by_poke_where_the_last_one_led_and_the_best_goes_on():
+    view, search = island(), Search(horizon=3, candidates=20, elites=4)
+    goal, rollout = goal_at(view, [-0.15, 0, 0]), shift_along(view, 0.05)
+    found, drawn = (control.draw_sequences(np.random.default_rng(0), rollout, view, goal, CAMERA, SETTINGS,
+                                           replace(search, horizon=horizon)) for horizon in (3, 1))
+    np.testing.assert_array_equal(found[:, :1], drawn)
+    before = np.concatenate([np.zeros((20, 1, 2)), rollout(found)[0][:, :2, -1, :2]], axis=1)
+    assert np.abs(found[..., :2] - before).max() < 0.05, "targets lie on the object, where it then is"
+    away = np.abs(found[:, 1:, 2] % (2 * np.pi) - np.pi)
+    assert np.abs(np.cos(found[:, 0, 2])).min() < 0.5 and np.median(away) < 0.5, "the later ones go for the goal, -x"
 
 
 def test_where_bullet_finds_the_finger_s_way_taken_the_next_start_is_used_or_the_poke_is_spent(task, run, pokes,

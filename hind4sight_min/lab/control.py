@@ -5,7 +5,7 @@ which tries its pokes out in the simulator. One thing they are all told that no 
 down, Bullet is asked whether its way is free (`carry_out`). The first start of a poke where it is gets used; where it
 is nowhere free, the poke is spent.
 """
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,8 +17,8 @@ from .. import check_whole
 from ..geometry import Camera, project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
-from ..planning import (SLACK, NoPoke, Plan, draw_pokes, first_start, goal_of, learned_step, plan, possible_starts,
-                        roll, view_of)
+from ..planning import (SLACK, NoPoke, Plan, View, draw_pokes, first_start, goal_of, learned_step, moved_scene, plan,
+                        possible_starts, roll, sequence_cost, view_of)
 from ..scene import scene_of
 from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
@@ -30,6 +30,9 @@ IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 NEAR = 2.0  # cost below which places are right and turns are left, about
 GAIN = 0.01  # of the cost; a poke that is predicted to bring less is not worth its risk
+SLOW = 0.1  # of the lowest cost yet; where a poke brings less, one that costs first may bring more
+AHEAD = 3  # pokes: of two objects that swap one makes room, the other comes, the first follows
+TRIES = 32  # pokes of which a sequence that is drawn takes the best as its next
 CLEAR = 0.015, 0.02  # m; what passes nearer by something else pushes it; the second where a mark shall stay
 PASSES = 0.05, 0.03  # share of the points that move that may be predicted to do so
 STAYS = 0.002  # m; a mark that shall stay may be predicted to move so far
@@ -241,29 +244,61 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
-def two_ahead(search):
-    """A planning.Search for two pokes in a row, twice the candidates: of two objects that swap one must make room."""
-    return replace(search, horizon=2, candidates=min(2 * search.candidates, 10_000))
+def draw_sequences(rng, rollout, view, goal, camera, settings, search):
+    """A first population for CEM, (J, H, 3): first pokes as drawn, every later one the best of TRIES where those before
+    it lead. Not in the paper; of sequences drawn at once hardly one makes room for an object and brings it there.
+    """
+    def longer(sequence):
+        there = View(moved_scene(view, rollout(sequence[None])[0][:, -1]), view.marked)
+        tried = np.repeat(sequence[None], TRIES, axis=0)
+        tried = np.concatenate([tried, draw_pokes(rng, TRIES, there, settings)], axis=1)
+        return tried[np.argmin(sequence_cost(tried, rollout, view, goal, camera, search))]
+
+    sequences = draw_pokes(rng, search.candidates, view, settings)
+    for _ in range(search.horizon - 1):
+        sequences = np.stack([longer(sequence) for sequence in sequences])
+    return sequences
 
 
-def next_plan(policy, task, view, labels, goal, run, search, rng):
-    """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle."""
+def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
+    """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle.
+    rest: what is left of the plan before, one of the candidates where it is as long as they.
+    """
     arena, settings = task.arena, task.settings
     if policy in ("random", "greedy"):
         pokes = (draw_pokes(rng, 1, view, settings)[0] if policy == "random"
                  else greedy_poke(view, goal, arena.camera, settings, rng))
         return Plan(pokes, np.nan, np.nan)
+
+    def planned(rollout):
+        first = draw_sequences(rng, rollout, view, goal, arena.camera, settings, search)
+        if len(rest) == search.horizon:
+            first[0] = rest
+        return plan(rollout, view, goal, arena.camera, settings, search, rng, first=first)
+
     if policy == "oracle":
-        rollout = oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings)
-    else:
-        step = learned_step(run, view) if policy == "learned" else lambda clouds, pokes: clouds
-        rollout = partial(roll, step, view, settings=settings)
+        return planned(oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings))
+    step = learned_step(run, view) if policy == "learned" else lambda clouds, pokes: clouds
+    rollout = partial(roll, step, view, settings=settings)
     if policy == "learned":
         try:
-            return plan(careful(rollout, view, task.stays), view, goal, arena.camera, settings, search, rng)
+            return planned(careful(rollout, view, task.stays))
         except NoPoke:
             pass  # then without care
-    return plan(rollout, view, goal, arena.camera, settings, search, rng)
+    return planned(rollout)
+
+
+def choose_plan(ask, search, rest, lowest):
+    """The Plan to follow: of one poke, or the rest of the last plan; where that would hardly better the `lowest` cost
+    yet, far from the goal, one of AHEAD pokes if these gain more each. ask: search, rest -> Plan, as `next_plan`.
+    """
+    found = ask(replace(search, horizon=max(len(rest), search.horizon)), rest)
+    better = (1 - SLOW) * min(lowest, found.now)
+    if found.now > NEAR and found.cost > better and len(found.pokes) < AHEAD:
+        with suppress(NoPoke):  # so far ahead; what was found stays
+            further = ask(replace(search, horizon=AHEAD), ())
+            found = max(found, further, key=lambda plan: (plan.now - plan.cost) / len(plan.pokes))
+    return found
 
 
 # --- the closed loop ----------------------------------------------------------------------------------------------
@@ -305,8 +340,8 @@ def distances(poses, task):
 def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. Where one
-    poke ahead sees no gain far from the goal, it looks two ahead before it stops.
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. How far
+    it looks ahead: `choose_plan`.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
@@ -319,22 +354,22 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     check_camera(arena.camera, Camera(**run.meta["camera"]))
     (rgb, depth, labels), view, goal = first_look(task)
     states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
-    stopped = f"the budget of pokes, {budget}, is spent"
+    stopped, rest, lowest = f"the budget of pokes, {budget}, is spent", [], np.inf
     while len(pokes) < budget:
         try:
-            found = next_plan(policy, task, view, labels, goal, run, search, rng)
-            if found.cost > found.now - GAIN and found.now > NEAR and search.horizon == 1:
-                found = next_plan(policy, task, view, labels, goal, run, two_ahead(search), rng)
+            ask = partial(next_plan, policy, task, view, labels, goal, run, rng)
+            found = choose_plan(ask, search, rest, lowest)
         except NoPoke as none:
             if not pokes:
                 raise
             stopped = str(none)
             break
         if found.cost > found.now - GAIN:
-            ahead = "no poke" if len(found.pokes) == 1 else f"no {len(found.pokes)} pokes in a row"
-            stopped = f"{ahead} would help, the model says; what is left costs {found.now:.2f}"
+            ahead = f", nor {AHEAD} in a row" if found.now > NEAR else ""
+            stopped = f"no poke would help{ahead}, the model says; what is left costs {found.now:.2f}"
             break
         pokes.append(found.pokes[0])
+        rest, lowest = found.pokes[1:], min(lowest, found.now)
         starts.append(carry_out(arena, view, pokes[-1], task.settings))
         (rgb, depth, labels), marks = arena.observe(), view.marks
         scene = scene_in(arena, rgb, depth)

@@ -339,7 +339,8 @@ def run_scene(checkpoint, out, planner, movers, seed, attempt=0):
     return once(out / "scenes" / f"{planner}-{movers}-{seed}-{attempt}.json", plain({
         "vector": float(np.abs(run.vector).sum()), "search": asdict(search), "pokes": POKES,
         "settings": control.settings_for(run).plain,
-        "loop": [control.GAIN, control.NEAR, control.CLEAR, control.PASSES, control.STAYS, control.KEEP_OFF]}), compute)
+        "loop": [control.GAIN, control.NEAR, control.SLOW, control.AHEAD, control.TRIES, control.CLEAR, control.PASSES,
+                 control.STAYS, control.KEEP_OFF]}), compute)
 
 
 def outcome(record):
