@@ -297,3 +297,8 @@ def test_a_checkpoint_that_does_not_fit_names_what_differs(tmp_path, spoil, said
 def test_a_recipe_refuses(name, bad, said):
     with pytest.raises(ValueError, match=f"{name}: .*expected .*{said}"):
         Recipe(**{name: bad})
+
+
+def test_no_pokes_at_all_are_refused():
+    with pytest.raises(ValueError, match="data: pokes: expected .*>= 1, got 0"):
+        train(tiny_pokes()[:0], start_run(TINY, tiny_pokes()))
