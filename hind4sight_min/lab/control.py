@@ -340,8 +340,8 @@ def distances(poses, task):
 def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. How far
-    it looks ahead: `choose_plan`.
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. It looks
+    ahead as `choose_plan` says, but where a mark shall stay no further than `search`: errors add up.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
@@ -358,15 +358,14 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     while len(pokes) < budget:
         try:
             ask = partial(next_plan, policy, task, view, labels, goal, run, rng)
-            found = choose_plan(ask, search, rest, lowest)
+            found = ask(search) if task.stays.any() else choose_plan(ask, search, rest, lowest)
         except NoPoke as none:
             if not pokes:
                 raise
             stopped = str(none)
             break
         if found.cost > found.now - GAIN:
-            ahead = f", nor {AHEAD} in a row" if found.now > NEAR else ""
-            stopped = f"no poke would help{ahead}, the model says; what is left costs {found.now:.2f}"
+            stopped = f"no poke would help, the model says; what is left costs {found.now:.2f}"
             break
         pokes.append(found.pokes[0])
         rest, lowest = found.pokes[1:], min(lowest, found.now)
