@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
 
@@ -329,6 +330,15 @@ def paper_tables():
     return tables.tables_text(list(tables.TABLES), figures)
 
 
+def tables_so_far(kept=CELLS):
+    """Of the cells that are kept, tables of the models of which every seed is finished."""
+    kept = of_today(json.loads(kept.read_text())) if kept.exists() else {}
+    cells = [cell for cell in tables.cells_of_tables(list(tables.TABLES), tables.FULL) if cell.name in kept]
+    seeds = Counter(cell.group for cell in cells)
+    results = {cell: kept[cell.name]["metrics"] for cell in cells if seeds[cell.group] == len(tables.FULL.seeds)}
+    return tables.tables_text(["flow", "ablation"], tables.summarise(results, tables.FULL)) or "None yet."
+
+
 def control_table():
     """The control experiment, once it is recorded; the learned model's part is run again more often than the rest."""
     figures = {**(recorded("planning") or {}), **(recorded("planning_learned") or {})}
@@ -353,7 +363,8 @@ def pages(summary):
     """{page: {marker: what stands between `<!-- marker: ... -->` and `<!-- /marker -->`}}."""
     return {ROOT / "README.md": {"figures": table(summary, FRONT)},
             ROOT / "docs" / "results.md": {"figures": table(summary), "tables": paper_tables(),
-                                           "control": control_table(), "cameras": table_of("camera")},
+                                           "so far": tables_so_far(), "control": control_table(),
+                                           "cameras": table_of("camera")},
             ROOT / "docs" / "not-in-the-paper.md": {"left out": table_of("leave_one_out")}}
 
 
