@@ -139,12 +139,9 @@ def transform_layer(points, masks, rotations, translations):
     points (B, N, 3) m; masks (B, N, K), summing to 1 over K; rotations (B, K, 3, 3); translations (B, K, 3) m.
     Returns the predicted points (B, N, 3) m. Raises ValueError for other shapes.
     """
+    points, masks, rotations, translations = as_arrays(
+        "BN3 BNK BK33 BK3", points=points, masks=masks, rotations=rotations, translations=translations)
     batch, count = points.shape[0], masks.shape[-1]
-    if points.ndim != 3 or masks.shape != points.shape[:2] + (count,) or rotations.shape != (batch, count, 3, 3) \
-            or translations.shape != (batch, count, 3):
-        raise ValueError("transform_layer: expected points (B, N, 3), masks (B, N, K), rotations (B, K, 3, 3), "
-                         f"translations (B, K, 3), got {points.shape}, {masks.shape}, {rotations.shape}, "
-                         f"{translations.shape}")
     moved = (anp.matmul(anp.reshape(points, (batch, 1, -1, 3)), anp.swapaxes(rotations, 2, 3))
              + anp.reshape(translations, (batch, count, 1, 3)))  # (B, K, N, 3): R_k P + T_k
     weights = anp.reshape(anp.swapaxes(masks, 1, 2), (batch, count, -1, 1))

@@ -81,7 +81,8 @@ class Interactions:
 
 def grid_shape(settings):
     """(rows, columns) of the arena's grid of cells; rows run along y, columns along x."""
-    return (round(settings["arena"] / settings["cell"]),) * 2
+    cells = int(round(settings["arena"] / settings["cell"]))
+    return cells, cells
 
 
 def cells_of(xy, settings):

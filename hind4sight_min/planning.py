@@ -150,7 +150,8 @@ def roll(step, view, sequences, settings):
     """What sequences of pokes (J, H, 3) lead to -> clouds (J, H, N + M, 3) m after each, starts (J, H, 2) m, NaN where
     the finger finds no room. step: clouds (J, N + M, 3), pokes (J, 3) -> clouds after one poke.
     """
-    clouds, after, starts = np.repeat(view.cloud[None], len(sequences), axis=0), [], []
+    clouds = np.repeat(view.cloud[None], len(sequences), axis=0)
+    after, starts = [], []
     for pokes in np.moveaxis(sequences, 1, 0):
         starts.append(first_start(possible_starts(pokes, occupied_grid(clouds, view.occupied, settings), settings)))
         clouds = step(clouds, pokes)
@@ -197,15 +198,6 @@ def planning_cost(clouds, view, goal, camera, search):
     return cost
 
 
-def sequence_cost(sequences, rollout, view, goal, camera, search):
-    """The cost of the scene after the last poke of sequences (J, H, 3), for to make room for another is no gain yet
-    -> (J,), infinite where a poke has no start.
-    """
-    clouds, starts = rollout(sequences)
-    found = planning_cost(clouds[:, -1], view, goal, camera, search)
-    return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, found)
-
-
 # --- the cross entropy method -------------------------------------------------------------------------------------
 
 LEAST = np.array([0.002, 0.002, 0.03])  # m, m, rad: a narrower Gaussian only draws the same pokes again
@@ -234,7 +226,8 @@ def cem(cost, population, rng, search, on_iteration=None):
     """
     best, lowest = None, np.inf
     for iteration in range(search.iterations):
-        costs = np.nan_to_num(np.asarray(cost(population), float), nan=np.inf, posinf=np.inf)  # NaN loses
+        costs = np.asarray(cost(population), float)
+        costs = np.where(np.isnan(costs), np.inf, costs)  # NaN loses
         order = np.argsort(costs, kind="stable")
         if costs[order[0]] < lowest:
             best, lowest = population[order[0]].copy(), float(costs[order[0]])
@@ -258,11 +251,17 @@ class Plan:
     now: float
 
 
-def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None, first=None):
-    """The best sequence of pokes to a goal that CEM finds -> Plan. first (J, H, 3): its first population, if not drawn
-    by `draw_pokes`.
+def plan(rollout, view, goal, camera, settings, search, rng, on_iteration=None, draw=None):
+    """The best sequence of pokes to a goal that CEM finds -> Plan. draw: what makes the first population (J, H, 3) of
+    the cost of sequences, instead of `draw_pokes`.
+
+    The cost of a sequence is that of the scene after its last poke: to make room for another is no gain yet.
     """
-    first = draw_pokes(rng, search.candidates, view, settings, search.horizon) if first is None else first
-    pokes, lowest = cem(lambda each: sequence_cost(each, rollout, view, goal, camera, search), first, rng, search,
-                        on_iteration)
+    def cost(sequences):
+        clouds, starts = rollout(sequences)
+        found = planning_cost(clouds[:, -1], view, goal, camera, search)
+        return np.where(np.isnan(starts).any(axis=(1, 2)), np.inf, found)
+
+    first = draw(cost) if draw else draw_pokes(rng, search.candidates, view, settings, search.horizon)
+    pokes, lowest = cem(cost, first, rng, search, on_iteration)
     return Plan(pokes, lowest, float(planning_cost(view.cloud[None], view, goal, camera, search)[0]))

@@ -199,7 +199,8 @@ def start_run(recipe, interactions):
     params = init_parameters(recipe.sizes, np.random.default_rng(recipe.seed))
     vector = np.concatenate([value.ravel() for value in params.values()])
     meta = {"camera": interactions.camera.plain, "settings": interactions.settings}
-    return Run(recipe, {name: value.shape for name, value in params.items()}, vector, 0 * vector, 0 * vector, meta=meta)
+    return Run(recipe, {name: value.shape for name, value in params.items()}, vector,
+               np.zeros_like(vector), np.zeros_like(vector), meta=meta)
 
 
 def rows_of_step(recipe, count, step):
@@ -208,7 +209,8 @@ def rows_of_step(recipe, count, step):
     Every epoch is a permutation of the rows; a batch may straddle two epochs.
     """
     check_whole("data: pokes", count, 1)
-    first, rows = step * recipe.batch, []
+    first = step * recipe.batch
+    rows = []
     for epoch in range(first // count, (first + recipe.batch - 1) // count + 1):
         order = np.random.default_rng([recipe.seed, 1, epoch]).permutation(count)
         rows.append(order[max(first - epoch * count, 0):first + recipe.batch - epoch * count])

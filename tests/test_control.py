@@ -16,7 +16,7 @@ from hind4sight_min.geometry import project, unproject
 from hind4sight_min.lab import control
 from hind4sight_min.lab.cli import data_small
 from hind4sight_min.lab.marks import places_at
-from hind4sight_min.planning import Goal, Plan, Search
+from hind4sight_min.planning import Goal, Plan, Search, planning_cost
 from hind4sight_min.sim.truth import true_scene_flow
 
 SMALL = Search(candidates=16, elites=4, iterations=2)
@@ -243,50 +243,95 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
         control.closed_loop(task, run, "learned", SMALL, budget=5)
 
 
-@pytest.mark.parametrize("now, costs, lowest, rest, asked, pokes", [
-    (1.9, {1: 1.8}, np.inf, 0, [(1, 0)], 1),  # near the goal one is enough
-    (5.0, {1: 4.4}, np.inf, 0, [(1, 0)], 1),  # it brings more than a tenth
-    (5.0, {1: 4.6, 3: 2.0}, np.inf, 0, [(1, 0), (3, 0)], 3),
-    (5.0, {1: 4.6, 3: 4.0}, np.inf, 0, [(1, 0), (3, 0)], 1),  # three bring less each
-    (5.0, {1: 4.4, 3: 2.0}, 4.5, 0, [(1, 0), (3, 0)], 3),  # it only takes back what the last poke did
-    (5.0, {1: 4.6, 3: None}, np.inf, 0, [(1, 0), (3, 0)], 1),  # no room, so far ahead
-    (5.0, {2: 4.0}, np.inf, 2, [(2, 2)], 2),  # the rest of a plan
-    (5.0, {2: 4.8, 3: 2.0}, np.inf, 2, [(2, 2), (3, 0)], 3)])
-def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now, costs, lowest, rest, asked, pokes):
-    calls = []
+@pytest.mark.parametrize("now, costs, lowest, rest, left, asked, pokes", [
+    (1.9, {1: 1.8}, np.inf, 0, 9, [1], 1),  # near the goal one is enough
+    (5.0, {1: 4.4}, np.inf, 0, 9, [1], 1),  # it brings more than a tenth
+    (np.nan, {1: np.nan}, np.inf, 0, 9, [1], 1),  # a planner without costs
+    (5.0, {1: 4.6, 3: 2.0}, np.inf, 0, 9, [1, 3], 3),
+    (5.0, {1: 4.6, 3: 4.0}, np.inf, 0, 9, [1, 3], 1),  # three bring less each
+    (5.0, {1: 4.4, 3: 2.0}, 4.5, 0, 9, [1, 3], 3),  # it only takes back what the last poke did
+    (5.0, {1: 4.6, 3: None}, np.inf, 0, 9, [1, 3], 1),  # no room, so far ahead
+    (5.0, {1: 4.6, 2: 2.0}, np.inf, 0, 2, [1, 2], 2), (5.0, {1: 4.6}, np.inf, 0, 1, [1], 1),  # no more than are left
+    (5.0, {2: 4.0}, np.inf, 2, 9, [2], 2),  # the rest of a plan
+    (5.0, {2: 4.8, 1: 4.4}, np.inf, 2, 9, [2, 1], 1),  # which brings little now
+    (5.0, {2: None, 1: 4.8, 3: 2.0}, np.inf, 2, 9, [2, 1, 3], 3),
+    (1.5, {2: 1.6, 1: 1.49}, np.inf, 2, 9, [2, 1], 1), (5.0, {1: None, 3: None}, np.inf, 0, 9, [1, 3], 0)])
+def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now, costs, lowest, rest, left, asked,
+                                                                           pokes):
+    calls, rest = [], np.ones((rest, 3))
 
-    def ask(search, rest):
-        calls.append((search.horizon, len(rest)))
+    def ask(search, given):
+        calls.append(search.horizon)
+        assert given is rest
         if costs[search.horizon] is None:
             raise planning.NoPoke("no room")
         return Plan(np.zeros((search.horizon, 3)), costs[search.horizon], now)
-    assert len(control.choose_plan(ask, SMALL, np.zeros((rest, 3)), lowest).pokes) == pokes
+    if pokes:
+        assert len(control.choose_plan(ask, SMALL, rest, lowest, left).pokes) == pokes
+    else:
+        with pytest.raises(planning.NoPoke, match="no room"):
+            control.choose_plan(ask, SMALL, rest, lowest, left)
     assert calls == asked
 
 
 def test_a_plan_is_followed_and_why_it_ends_is_said(task, run, pokes, monkeypatch):
-    asked = []
+    asked, nows = [], [5.0, 6.0, 7.0]
 
-    def choose_plan(ask, search, rest, lowest):
-        asked.append((len(rest), lowest))
-        return Plan(pokes, (0.0, 5.0)[len(asked) // 2], 5.0)
+    def choose_plan(ask, search, rest, lowest, left):
+        now = nows[len(asked)]
+        asked.append((np.reshape(rest, (-1, 3)).tolist(), lowest, left))
+        return Plan(pokes, (0.0, 0.0, now)[len(asked) - 1], now)
     monkeypatch.setattr(control, "choose_plan", choose_plan)
+    places = [np.zeros(2), np.full(2, np.nan)]  # the second poke finds no room
+    monkeypatch.setattr(control, "carry_out", lambda *given: places[len(asked) - 1])
     record = control.closed_loop(task, run, "learned", SMALL, budget=5)
-    np.testing.assert_array_equal(record["pokes"], pokes[:1])
-    assert asked == [(0, np.inf), (1, 5.0)]
-    assert record["stopped"] == "no poke would help, the model says; what is left costs 5.00"
+    np.testing.assert_array_equal(record["pokes"], pokes[[0, 0]])
+    assert asked == [([], np.inf, 5), (pokes[1:].tolist(), 5.0, 4), ([], 5.0, 3)]
+    assert record["stopped"] == "no poke would help, the model says; what is left costs 7.00"
+
+
+def test_where_a_mark_shall_stay_it_looks_no_further_than_it_is_told(task, run, pokes, monkeypatch):
+    next_plans(monkeypatch, pokes)
+    monkeypatch.setattr(control, "choose_plan", None)
+    monkeypatch.setattr(control, "SLACK", 1.0)  # m: so near to its goal every mark is
+    np.testing.assert_array_equal(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"], pokes[:1])
 
 
 def test_sequences_are_drawn_poke_by_poke_where_the_last_one_led_and_the_best_goes_on():
     view, search = island(), Search(horizon=3, candidates=20, elites=4)
     goal, rollout = goal_at(view, [-0.15, 0, 0]), shift_along(view, 0.05)
-    found, drawn = (control.draw_sequences(np.random.default_rng(0), rollout, view, goal, CAMERA, SETTINGS,
-                                           replace(search, horizon=horizon)) for horizon in (3, 1))
-    np.testing.assert_array_equal(found[:, :1], drawn)
+
+    def drawn(horizon, rest=(), rollout=rollout, view=view):
+        return control.draw_sequences(
+            lambda sequences: planning_cost(rollout(sequences)[0][:, -1], view, goal, CAMERA, search),
+            np.random.default_rng(0), rollout, view, SETTINGS, replace(search, horizon=horizon), rest)
+    found = drawn(3)
+    np.testing.assert_array_equal(found[:, :1], drawn(1))
     before = np.concatenate([np.zeros((20, 1, 2)), rollout(found)[0][:, :2, -1, :2]], axis=1)
     assert np.abs(found[..., :2] - before).max() < 0.05, "targets lie on the object, where it then is"
-    away = np.abs(found[:, 1:, 2] % (2 * np.pi) - np.pi)
-    assert np.abs(np.cos(found[:, 0, 2])).min() < 0.5 and np.median(away) < 0.5, "the later ones go for the goal, -x"
+    assert np.median(np.abs(found[:, 1:, 2] % (2 * np.pi) - np.pi)) < 0.5, "the later ones go for the goal, -x"
+    rest = np.ones((2, 3), np.float32)
+    np.testing.assert_array_equal(drawn(2, rest)[0], rest)
+    assert len(drawn(2, rest)) == 21 and len(drawn(3, rest)) == 20
+
+    x, y = np.meshgrid(np.arange(-0.24, 0.25, 0.02), np.arange(-0.24, 0.25, 0.02))
+    everywhere = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)])
+    heap = island(marks=np.full(everywhere.shape, [0, 0, 0.03]))
+
+    def scattered(sequences):  # by pokes to the left: no finger finds room then
+        clouds, starts = shift_along(heap, 0.0)(sequences)
+        clouds[sequences[:, 0, 2] > 0, :, -len(everywhere):] = everywhere
+        return clouds, starts
+    assert 0 < len(drawn(2, rollout=scattered, view=heap)) < 20, "what leaves no room for the next poke is dropped"
+
+
+def test_the_rest_of_a_plan_is_a_candidate_of_the_next(task, run):
+    (_, _, labels), view, goal = control.first_look(task)
+    best = control.next_plan("learned", task, view, labels, goal, run, np.random.default_rng(0), Search())
+    search = Search(candidates=4, elites=2, iterations=1)
+    alone, found = (control.next_plan("learned", task, view, labels, goal, run, np.random.default_rng(9), search, rest)
+                    for rest in ((), best.pokes))
+    assert found.cost <= best.cost < alone.cost
 
 
 def test_where_bullet_finds_the_finger_s_way_taken_the_next_start_is_used_or_the_poke_is_spent(task, run, pokes,

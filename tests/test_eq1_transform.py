@@ -135,11 +135,13 @@ def test_gradient_of_the_transform_layer(argnum, name):
     assert_float32(transform_layer, argnum, *random_inputs())
 
 
-@pytest.mark.parametrize("argnum, shape", [(0, (5, 3)), (0, (2, 4, 3)), (1, (2, 4, 3)), (1, (2, 5, 4)), (2, (2, 3, 9)),
-                                           (2, (1, 3, 3, 3)), (3, (2, 3, 4)), (3, (2, 4, 3))])
-def test_transform_layer_refuses_other_shapes(argnum, shape):
+@pytest.mark.parametrize("argnum, shape, named", [
+    (0, (5, 3), "points"), (0, (2, 4, 3), "masks"), (1, (2, 4, 3), "masks"), (1, (2, 5, 4), "rotations"),
+    (2, (2, 3, 9), "rotations"), (2, (1, 3, 3, 3), "rotations"), (3, (2, 3, 4), "translations"),
+    (3, (2, 4, 3), "translations")])
+def test_transform_layer_refuses_other_shapes(argnum, shape, named):
     from hind4sight_min.geometry import transform_layer
     inputs = random_inputs()
     inputs[argnum] = np.ones(shape)  # NumPy would broadcast some of these and say nothing
-    with pytest.raises(ValueError, match="points.*masks.*rotations.*translations"):
+    with pytest.raises(ValueError, match=f"{named}: expected floating-point numbers of shape"):
         transform_layer(*inputs)

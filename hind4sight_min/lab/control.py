@@ -5,7 +5,7 @@ which tries its pokes out in the simulator. One thing they are all told that no 
 down, Bullet is asked whether its way is free (`carry_out`). The first start of a poke where it is gets used; where it
 is nowhere free, the poke is spent.
 """
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +18,7 @@ from ..geometry import Camera, project, unproject
 from ..interactions import occupied_grid
 from ..networks import predict
 from ..planning import (SLACK, NoPoke, Plan, View, draw_pokes, first_start, goal_of, learned_step, moved_scene, plan,
-                        possible_starts, roll, sequence_cost, view_of)
+                        possible_starts, roll, view_of)
 from ..scene import scene_of
 from ..sim.arena import MIDDLE, Arena, Settings
 from ..sim.truth import true_scene_flow
@@ -29,8 +29,8 @@ SETTINGS = Settings(**{**MIDDLE, "place_within": 0.56})  # so that the finger ge
 IN_THE_WAY = 0.5  # of both radii: how far beside the straight way the middle of an obstacle lies
 FAR = (0.08, 0.14)  # m; how far a goal is from its object's place
 NEAR = 2.0  # cost below which places are right and turns are left, about
-GAIN = 0.01  # of the cost; a poke that is predicted to bring less is not worth its risk
-SLOW = 0.1  # of the lowest cost yet; where a poke brings less, one that costs first may bring more
+GAIN = 0.01  # in units of the cost; a poke that is predicted to bring less is not worth its risk
+SLOW = 0.1  # a plan must end below the lowest cost yet by this share of it, or a longer one is looked for
 AHEAD = 3  # pokes: of two objects that swap one makes room, the other comes, the first follows
 TRIES = 32  # pokes of which a sequence that is drawn takes the best as its next
 CLEAR = 0.015, 0.02  # m; what passes nearer by something else pushes it; the second where a mark shall stay
@@ -244,25 +244,33 @@ def greedy_poke(view, goal, camera, settings, rng):
     return draw_pokes(rng, 1, view, settings)[0]
 
 
-def draw_sequences(rng, rollout, view, goal, camera, settings, search):
+def draw_sequences(cost, rng, rollout, view, settings, search, rest):
     """A first population for CEM, (J, H, 3): first pokes as drawn, every later one the best of TRIES where those before
-    it lead. Not in the paper; of sequences drawn at once hardly one makes room for an object and brings it there.
+    it lead; and `rest`, where it is as long. Not in the paper: of sequences drawn at once hardly one makes room for an
+    object and brings it there. Asks the rollout for 10,000 pokes where H is 3 and J 64, CEM for 256 where H is 1.
     """
-    def longer(sequence):
+    def longer(sequence):  # -> a list of one, or none where the finger then finds no room
         there = View(moved_scene(view, rollout(sequence[None])[0][:, -1]), view.marked)
-        tried = np.repeat(sequence[None], TRIES, axis=0)
-        tried = np.concatenate([tried, draw_pokes(rng, TRIES, there, settings)], axis=1)
-        return tried[np.argmin(sequence_cost(tried, rollout, view, goal, camera, search))]
+        try:
+            following = draw_pokes(rng, TRIES, there, settings)
+        except NoPoke:
+            return []
+        tried = np.concatenate([np.repeat(sequence[None], TRIES, axis=0), following], axis=1)
+        return [tried[np.argmin(cost(tried))]]
 
     sequences = draw_pokes(rng, search.candidates, view, settings)
     for _ in range(search.horizon - 1):
-        sequences = np.stack([longer(sequence) for sequence in sequences])
-    return sequences
+        sequences = [each for sequence in sequences for each in longer(sequence)]
+    if len(rest) == search.horizon:
+        sequences = [rest, *sequences]
+    if not len(sequences):
+        raise NoPoke(f"plan: no room for {search.horizon} pokes in a row")
+    return np.stack(sequences)
 
 
 def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
     """What a planner would do now -> planning.Plan; costs of NaN where it has none. labels (H, W): for the oracle.
-    rest: what is left of the plan before, one of the candidates where it is as long as they.
+    rest (n, 3): what is left of the plan before.
     """
     arena, settings = task.arena, task.settings
     if policy in ("random", "greedy"):
@@ -271,10 +279,8 @@ def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
         return Plan(pokes, np.nan, np.nan)
 
     def planned(rollout):
-        first = draw_sequences(rng, rollout, view, goal, arena.camera, settings, search)
-        if len(rest) == search.horizon:
-            first[0] = rest
-        return plan(rollout, view, goal, arena.camera, settings, search, rng, first=first)
+        return plan(rollout, view, goal, arena.camera, settings, search, rng, draw=partial(
+            draw_sequences, rng=rng, rollout=rollout, view=view, settings=settings, search=search, rest=rest))
 
     if policy == "oracle":
         return planned(oracle_rollout(arena, view, np.append(labels.ravel(), task.marked + 1), settings))
@@ -288,17 +294,25 @@ def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
     return planned(rollout)
 
 
-def choose_plan(ask, search, rest, lowest):
-    """The Plan to follow: of one poke, or the rest of the last plan; where that would hardly better the `lowest` cost
-    yet, far from the goal, one of AHEAD pokes if these gain more each. ask: search, rest -> Plan, as `next_plan`.
+def choose_plan(ask, search, rest, lowest, left):
+    """The Plan to follow, of no more pokes than are left: as many as the rest of the last plan has; where that is not
+    enough, one of `search`; where that is not either, far from the goal, one of AHEAD; whichever gains most per poke.
+
+    Not in the paper. Enough: it ends below the lowest cost yet by SLOW of it. ask: (search, rest) -> Plan, `next_plan`.
     """
-    found = ask(replace(search, horizon=max(len(rest), search.horizon)), rest)
-    better = (1 - SLOW) * min(lowest, found.now)
-    if found.now > NEAR and found.cost > better and len(found.pokes) < AHEAD:
-        with suppress(NoPoke):  # so far ahead; what was found stays
-            further = ask(replace(search, horizon=AHEAD), ())
-            found = max(found, further, key=lambda plan: (plan.now - plan.cost) / len(plan.pokes))
-    return found
+    plans = []
+    for horizon in dict.fromkeys(min(pokes, left) for pokes in (len(rest), search.horizon, AHEAD)):
+        last = plans[-1] if plans else None
+        enough = last and not last.cost > (1 - SLOW) * min(lowest, last.now)  # where there are no costs, any is
+        if not horizon or enough or last and horizon > search.horizon and last.now <= NEAR:
+            continue
+        try:
+            plans.append(ask(replace(search, horizon=horizon), rest))
+        except NoPoke as none:
+            reason = none
+    if not plans:
+        raise reason
+    return max(plans, key=lambda plan: (plan.now - plan.cost) / len(plan.pokes))
 
 
 # --- the closed loop ----------------------------------------------------------------------------------------------
@@ -341,7 +355,7 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
     policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. It looks
-    ahead as `choose_plan` says, but where a mark shall stay no further than `search`: errors add up.
+    ahead as `choose_plan` says, but where a mark shall stay no further than `search`: it was pushed as often.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
@@ -358,7 +372,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     while len(pokes) < budget:
         try:
             ask = partial(next_plan, policy, task, view, labels, goal, run, rng)
-            found = ask(search) if task.stays.any() else choose_plan(ask, search, rest, lowest)
+            left = budget - len(pokes)
+            found = ask(search) if task.stays.any() else choose_plan(ask, search, rest, lowest, left)
         except NoPoke as none:
             if not pokes:
                 raise
@@ -368,8 +383,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
             stopped = f"no poke would help, the model says; what is left costs {found.now:.2f}"
             break
         pokes.append(found.pokes[0])
-        rest, lowest = found.pokes[1:], min(lowest, found.now)
         starts.append(carry_out(arena, view, pokes[-1], task.settings))
+        rest, lowest = found.pokes[1:] if np.isfinite(starts[-1]).all() else [], min(lowest, found.now)
         (rgb, depth, labels), marks = arena.observe(), view.marks
         scene = scene_in(arena, rgb, depth)
         if np.isfinite(starts[-1]).all():
