@@ -161,7 +161,8 @@ lesson.keep(options, figure, "population")
 # and plans anew, until no poke is predicted to help or the pokes are spent. Between two pictures it must find the
 # marked point again: `lab.marks.follow` starts from the motion that the model predicts for the mark's mask and corrects
 # it by registering the two pictures. Pokes under which something would pass through something else are ruled out
-# (`lab.control.careful`): what a pushed object meets next, the model sees less well.
+# (`lab.control.careful`): what a pushed object meets next, the model sees less well. Far from the goal, where one poke
+# would hardly help, it plans three in a row (`lab.control.choose_plan`): of two objects that swap, one must make room.
 
 # %%
 if simulator:
