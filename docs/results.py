@@ -330,9 +330,9 @@ def paper_tables():
     return tables.tables_text(list(tables.TABLES), figures)
 
 
-def tables_so_far(kept=CELLS):
+def tables_so_far(path=CELLS):
     """Of the cells that are kept, tables of the models of which every seed is finished."""
-    kept = of_today(json.loads(kept.read_text())) if kept.exists() else {}
+    kept = of_today(json.loads(path.read_text())) if path.exists() else {}
     cells = [cell for cell in tables.cells_of_tables(list(tables.TABLES), tables.FULL) if cell.name in kept]
     seeds = Counter(cell.group for cell in cells)
     results = {cell: kept[cell.name]["metrics"] for cell in cells if seeds[cell.group] == len(tables.FULL.seeds)}

@@ -259,7 +259,7 @@ def run_reproduce(args):
             print(contact.contact_table(found))
         elif args.table == "planning":
             found, curves = tables.reproduce_planning(out, checkpoint, 4 if args.quick else 20, map,
-                                                             args.planners)
+                                                      args.planners)
             print(tables.planning_table(found))
             figures.save_figure(figures.control_figure(curves, tables.POKES), out / "planning.png")
         else:

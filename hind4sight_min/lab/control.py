@@ -384,10 +384,11 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
             break
         pokes.append(found.pokes[0])
         starts.append(carry_out(arena, view, pokes[-1], task.settings))
-        rest, lowest = found.pokes[1:] if np.isfinite(starts[-1]).all() else [], min(lowest, found.now)
+        rest, lowest = [], min(lowest, found.now)
         (rgb, depth, labels), marks = arena.observe(), view.marks
         scene = scene_in(arena, rgb, depth)
-        if np.isfinite(starts[-1]).all():
+        if np.isfinite(starts[-1]).all():  # else the poke is spent, and its plan with it
+            rest = found.pokes[1:]
             marks = follow(view, predict(run.params, run.recipe.sizes, view.scene, pokes[-1][None]), scene)
         states.append((rgb, arena.poses(), marks, *distances(arena.poses(), task)))
         if not scene.occupied.any():
