@@ -267,34 +267,36 @@ def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now,
             raise planning.NoPoke("no room")
         return Plan(np.zeros((search.horizon, 3)), costs[search.horizon], now)
     if pokes:
-        assert len(control.choose_plan(ask, SMALL, rest, lowest, left).pokes) == pokes
+        assert len(control.choose_plan(ask, SMALL, 3, rest, lowest, left).pokes) == pokes
     else:
         with pytest.raises(planning.NoPoke, match="no room"):
-            control.choose_plan(ask, SMALL, rest, lowest, left)
+            control.choose_plan(ask, SMALL, 3, rest, lowest, left)
     assert calls == asked
 
 
 def test_a_plan_is_followed_and_why_it_ends_is_said(task, run, pokes, monkeypatch):
     asked, nows = [], [5.0, 6.0, 7.0]
 
-    def choose_plan(ask, search, rest, lowest, left):
+    def choose_plan(ask, search, ahead, rest, lowest, left):
         now = nows[len(asked)]
-        asked.append((np.reshape(rest, (-1, 3)).tolist(), lowest, left))
+        asked.append((ahead, np.reshape(rest, (-1, 3)).tolist(), lowest, left))
         return Plan(pokes, (0.0, 0.0, now)[len(asked) - 1], now)
     monkeypatch.setattr(control, "choose_plan", choose_plan)
     places = [np.zeros(2), np.full(2, np.nan)]  # the second poke finds no room
     monkeypatch.setattr(control, "carry_out", lambda *given: places[len(asked) - 1])
-    record = control.closed_loop(task, run, "learned", SMALL, budget=5)
+    record = control.closed_loop(task, run, "learned", SMALL, budget=5, ahead=2)
     np.testing.assert_array_equal(record["pokes"], pokes[[0, 0]])
-    assert asked == [([], np.inf, 5), (pokes[1:].tolist(), 5.0, 4), ([], 5.0, 3)]
+    assert asked == [(2, [], np.inf, 5), (2, pokes[1:].tolist(), 5.0, 4), (2, [], 5.0, 3)]
     assert record["stopped"] == "no poke would help, the model says; what is left costs 7.00"
 
 
 def test_where_a_mark_shall_stay_it_looks_no_further_than_it_is_told(task, run, pokes, monkeypatch):
-    next_plans(monkeypatch, pokes)
-    monkeypatch.setattr(control, "choose_plan", None)
-    monkeypatch.setattr(control, "SLACK", 1.0)  # m: so near to its goal every mark is
-    np.testing.assert_array_equal(control.closed_loop(task, run, "learned", SMALL, budget=1)["pokes"], pokes[:1])
+    asked = []
+    monkeypatch.setattr(control, "choose_plan", lambda ask, search, ahead, *_: asked.append(ahead) or Plan(pokes, 0, 1))
+    for slack in (0.0, 1.0):  # m: so near to its goal a mark shall stay, none and every
+        monkeypatch.setattr(control, "SLACK", slack)
+        control.closed_loop(task, run, "learned", SMALL, budget=1)
+    assert asked == [3, 1]
 
 
 def test_sequences_are_drawn_poke_by_poke_where_the_last_one_led_and_the_best_goes_on():

@@ -294,14 +294,14 @@ def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
     return planned(rollout)
 
 
-def choose_plan(ask, search, rest, lowest, left):
+def choose_plan(ask, search, ahead, rest, lowest, left):
     """The Plan to follow, of no more pokes than are left: as many as the rest of the last plan has; where that is not
-    enough, one of `search`; where that is not either, far from the goal, one of AHEAD; whichever gains most per poke.
+    enough, one of `search`; where that is not either, far from the goal, one of `ahead`; whichever gains most per poke.
 
     Not in the paper. Enough: it ends below the lowest cost yet by SLOW of it. ask: (search, rest) -> Plan, `next_plan`.
     """
     plans = []
-    for horizon in dict.fromkeys(min(pokes, left) for pokes in (len(rest), search.horizon, AHEAD)):
+    for horizon in dict.fromkeys(min(pokes, left) for pokes in (len(rest), search.horizon, ahead)):
         last = plans[-1] if plans else None
         enough = last and not last.cost > (1 - SLOW) * min(lowest, last.now)  # where there are no costs, any is
         if not horizon or enough or last and horizon > search.horizon and last.now <= NEAR:
@@ -351,11 +351,12 @@ def distances(poses, task):
     return np.linalg.norm(here[:, :2] - there[:, :2], axis=1), angle
 
 
-def closed_loop(task, run, policy, search, budget=10, seed=0):
+def closed_loop(task, run, policy, search, budget=10, seed=0, ahead=AHEAD):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
-    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. It looks
-    ahead as `choose_plan` says, but where a mark shall stay no further than `search`: it was pushed as often.
+    policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. ahead:
+    pokes that are planned in a row where one hardly helps, as `choose_plan` says; where a mark shall stay it is no more
+    than `search` says, for it was pushed as often.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its
@@ -368,12 +369,12 @@ def closed_loop(task, run, policy, search, budget=10, seed=0):
     check_camera(arena.camera, Camera(**run.meta["camera"]))
     (rgb, depth, labels), view, goal = first_look(task)
     states, pokes, starts = [(rgb, arena.poses(), view.marks, *distances(arena.poses(), task))], [], []
+    ahead = search.horizon if task.stays.any() else ahead
     stopped, rest, lowest = f"the budget of pokes, {budget}, is spent", [], np.inf
     while len(pokes) < budget:
         try:
             ask = partial(next_plan, policy, task, view, labels, goal, run, rng)
-            left = budget - len(pokes)
-            found = ask(search) if task.stays.any() else choose_plan(ask, search, rest, lowest, left)
+            found = choose_plan(ask, search, ahead, rest, lowest, budget - len(pokes))
         except NoPoke as none:
             if not pokes:
                 raise
