@@ -496,7 +496,7 @@ COMMANDS = {  # name: what runs it, what it does, its arguments as argparse take
                   "contact: a model's error by what met what, in minutes"},
         "--checkpoint": {"default": SHIPPED["default"], "help": "the model to plan or poke with"},
         "--planners": {"nargs": "+", "choices": list(tables.PLANNERS), "default": list(tables.PLANNERS),
-                       "help": "of planning: which; all of them take hours"},
+                       "help": "of planning: which; all of them take most of an hour"},
         "--quick": {"action": "store_true", "help": "the same tables from little data, in under ten minutes"},
         "--out": {"help": "folder of data and runs (runs/ and reproduce, reproduce-quick, planning or contact)"},
         "--jobs": JOBS, "--cluster": CLUSTER, "--json": JSON}),

@@ -468,7 +468,6 @@ def save_film(path, frames, seconds):
 
 
 STYLES = {"learned": ("learned model, mean", PREDICTED, "-"),
-          "one_poke": ("the same, never more than one poke ahead", SKY, "-"),
           "oracle": ("the simulator as the model, one poke ahead", GREEN, "--"),
           "random": ("random pokes", PINK, ":"), "no_motion": ("model of no motion", "0.4", "-.")}
 

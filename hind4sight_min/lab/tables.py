@@ -327,8 +327,8 @@ def tables_text(tables, figures):
 
 # --- planning (Sec. IV-G) -----------------------------------------------------------------------------------------
 
-# name -> (what the table says, control.POLICIES, what its search changes, how many pokes in a row it plans); the
-# simulator would take minutes to plan three
+# name -> (what the table says, control.POLICIES, what its search changes, how many pokes in a row it may plan): the
+# simulator one, for with three it would make 10,000 each time
 PLANNERS = {
     "learned": ("learned model", "learned", {}, control.AHEAD),
     "one_poke": ("learned model, never more than one poke ahead", "learned", {}, 1),
