@@ -190,7 +190,8 @@ def test_tables_show_ours_beside_the_papers(figures):
                                     "5.100 \u00b1 0.141", "2.05 \u00b1 0.07", "2.55 \u00b1 0.07 |"]
     assert "| dis (FlowNet 2.0 in the paper) | both pictures | 0.11 | 3.00 | 5.0000 |" in text
     row = next(line for line in text.splitlines() if line.startswith("| the same, of kinds and textures never"))
-    assert row.split(" | ")[1:] == [f"{4 * TINY_SCALE.test_pokes:,}", "2.600 \u00b1 0.283", "", "", "0.65 \u00b1 0.07", " |"]
+    assert row.split(" | ")[1:] == [f"{4 * TINY_SCALE.test_pokes:,}", "2.600 \u00b1 0.283", "", "",
+                                    "0.65 \u00b1 0.07", " |"]
     assert "| 3 or 4 objects in the middle | " in text and "6 or 7 objects" not in text, "those that were met alone"
     assert "| full model |" in tables.tables_text(list(tables.TABLES), results.recorded("reproduce"))
     assert "| learned model |" in tables.planning_table(results.recorded("planning"))
