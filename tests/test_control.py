@@ -202,7 +202,7 @@ def test_closed_loop_brings_an_object_to_its_goal(run):
 
 @pytest.mark.parametrize("policy", ["random", "greedy", "no_motion", "oracle"])
 def test_the_other_planners(policy, task, run):
-    record = control.closed_loop(task, run, policy, SMALL, budget=2, seed=1)
+    record = control.closed_loop(task, run, policy, SMALL, budget=2, seed=1, ahead=1)
     left = record["distance"][-1, 0] / record["distance"][0, 0]
     if policy == "no_motion":  # under this model no poke helps, so none is made
         assert len(record["pokes"]) == 0 and left == 1 and record["starts"].shape == (0, 2)
@@ -243,7 +243,7 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
         control.closed_loop(task, run, "learned", SMALL, budget=5)
 
 
-@pytest.mark.parametrize("now, costs, lowest, rest, left, asked, pokes", [
+@pytest.mark.parametrize("now, costs, lowest, rest, left, asked, pokes, ahead", [(*case, 3) for case in [
     (1.9, {1: 1.8}, np.inf, 0, 9, [1], 1),  # near the goal one is enough
     (5.0, {1: 4.4}, np.inf, 0, 9, [1], 1),  # it brings more than a tenth
     (np.nan, {1: np.nan}, np.inf, 0, 9, [1], 1),  # a planner without costs
@@ -255,9 +255,10 @@ def test_of_a_plan_of_two_pokes_the_first_is_carried_out(task, run, pokes, monke
     (5.0, {2: 4.0}, np.inf, 2, 9, [2], 2),  # the rest of a plan
     (5.0, {2: 4.8, 1: 4.4}, np.inf, 2, 9, [2, 1], 1),  # which brings little now
     (5.0, {2: None, 1: 4.8, 3: 2.0}, np.inf, 2, 9, [2, 1, 3], 3),
-    (1.5, {2: 1.6, 1: 1.49}, np.inf, 2, 9, [2, 1], 1), (5.0, {1: None, 3: None}, np.inf, 0, 9, [1, 3], 0)])
+    (1.5, {2: 1.6, 1: 1.49}, np.inf, 2, 9, [2, 1], 1), (5.0, {1: None, 3: None}, np.inf, 0, 9, [1, 3], 0)]] + [
+    (5.0, {1: 4.6}, np.inf, 0, 9, [1], 1, 1), (5.0, {1: 4.6, 4: 1.0}, np.inf, 0, 9, [1, 4], 4, 4)])
 def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now, costs, lowest, rest, left, asked,
-                                                                           pokes):
+                                                                           pokes, ahead):
     calls, rest = [], np.ones((rest, 3))
 
     def ask(search, given):
@@ -267,10 +268,10 @@ def test_it_looks_further_ahead_where_a_poke_hardly_helps_far_from_the_goal(now,
             raise planning.NoPoke("no room")
         return Plan(np.zeros((search.horizon, 3)), costs[search.horizon], now)
     if pokes:
-        assert len(control.choose_plan(ask, SMALL, 3, rest, lowest, left).pokes) == pokes
+        assert len(control.choose_plan(ask, SMALL, ahead, rest, lowest, left).pokes) == pokes
     else:
         with pytest.raises(planning.NoPoke, match="no room"):
-            control.choose_plan(ask, SMALL, 3, rest, lowest, left)
+            control.choose_plan(ask, SMALL, ahead, rest, lowest, left)
     assert calls == asked
 
 

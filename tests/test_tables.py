@@ -139,7 +139,9 @@ def figures():
         value = base[cell.model] + 0.1 * (cell.seed - 1) + (0.5 if cell.noise == "noisy" else 0) - 0.4 * cell.long
         found[cell] = {name: (i + 1) * value for i, name in enumerate(METRICS)}
         if cell.long and cell.noise == "clean":
-            found[cell].update(unseen_flow_mse_ratio=4 * value, unseen_mask_iou=value, mask_iou=0.1 * value)
+            found[cell].update(unseen_flow_mse_ratio=4 * value, unseen_mask_iou=value, unseen_pokes=4000, pokes=1000,
+                               unseen_multi_flow_mse_ratio=5 * value, unseen_wall_flow_mse_ratio=6 * value,
+                               unseen_inverse_direction_deg=8 * value)
     return {**tables.summarise(found, TINY_SCALE), "dis_optical_epe_px": 3.0, "dis_optical_epe_all_px": 5.0,
             "farneback_optical_epe_px": 4.0, "farneback_optical_epe_all_px": 2.0}
 
@@ -190,11 +192,12 @@ def test_tables_show_ours_beside_the_papers(figures):
                                     "5.100 \u00b1 0.141", "2.05 \u00b1 0.07", "2.55 \u00b1 0.07 |"]
     assert "| dis (FlowNet 2.0 in the paper) | both pictures | 0.11 | 3.00 | 5.0000 |" in text
     row = next(line for line in text.splitlines() if line.startswith("| the same, of kinds and textures never"))
-    assert row.split(" | ")[1:] == [f"{4 * TINY_SCALE.test_pokes:,}", "2.600 \u00b1 0.283", "", "",
-                                    "0.65 \u00b1 0.07", " |"]
-    assert "| 3 or 4 objects in the middle | " in text and "6 or 7 objects" not in text, "those that were met alone"
+    assert row.split(" | ")[1:] == ["4,000", "2.600 \u00b1 0.283", "3.250 \u00b1 0.354", "3.900 \u00b1 0.424",
+                                    "0.65 \u00b1 0.07", "5.2 \u00b1 0.6 |"]
+    assert "| 3 or 4 objects in the middle | 1,000 | " in text, "a row for pokes that were met"
+    assert "6 or 7 objects" not in text, "a row for pokes that were not met"
     assert "| full model |" in tables.tables_text(list(tables.TABLES), results.recorded("reproduce"))
-    assert "| learned model |" in tables.planning_table(results.recorded("planning"))
+    assert "| learned model, up to three pokes ahead |" in tables.planning_table(results.recorded("planning"))
 
 
 # --- the control experiment ---------------------------------------------------------------------------------------
@@ -228,11 +231,13 @@ def test_scenes_are_run_once_with_random_numbers_of_their_own(tmp_path, monkeypa
         assert run_scene(*given) == first
     assert [policy for policy, *_ in asked] == ["learned", "greedy", "learned"]
     assert [search.chamfer_weight for _, search, *_ in asked] == [0, 1, 1]
-    assert [ahead for *_, ahead in asked] == [3, 3, 1]
+    assert [ahead for *_, ahead in asked] == [3, 1, 1]
     assert len({tuple(np.random.default_rng(seed).random(3)) for *_, seed, _ in asked}) == 3, "all tries are the same"
-    with monkeypatch.context() as patch, pytest.raises(ValueError, match="made with another"):
-        patch.setattr(control, "GAIN", 0.5)
-        run_scene("pixels", 1, 0)
+    others = {"pixels": (*tables.PLANNERS["pixels"][:3], 1)}
+    for module, name, value in ((control, "GAIN", 0.5), (tables, "PLANNERS", others)):
+        with monkeypatch.context() as patch, pytest.raises(ValueError, match="made with another"):
+            patch.setattr(module, name, value)
+            run_scene("pixels", 1, 0)
     checkpoints.save_run(tmp_path / "run.npz", training.start_run(replace(TINY, seed=4), data))
     with pytest.raises(ValueError, match="made with another"):
         run_scene("pixels", 1, 0)

@@ -287,7 +287,9 @@ def run_plan(args):
     with control.random_task(args.seed, args.objects, args.obstacle, settings) as task:
         if args.mark:
             task = control.marked_task(task, args.mark, args.goal)
-        record = control.photographed(control.closed_loop(task, run, args.policy, search, args.budget, args.seed), task)
+        ahead = search.horizon if args.policy == "oracle" else control.AHEAD  # the simulator would take a minute
+        record = control.closed_loop(task, run, args.policy, search, args.budget, args.seed, ahead)
+        record = control.photographed(record, task)
     distance = record["distance"].mean(axis=1)  # m
     for t, (poke, start) in enumerate(zip(record["pokes"], record["starts"])):
         done = "" if np.isfinite(start).all() else "  (no room for the finger: not carried out)"

@@ -245,9 +245,12 @@ def greedy_poke(view, goal, camera, settings, rng):
 
 
 def draw_sequences(cost, rng, rollout, view, settings, search, rest):
-    """A first population for CEM, (J, H, 3): first pokes as drawn, every later one the best of TRIES where those before
-    it lead; and `rest`, where it is as long. Not in the paper: of sequences drawn at once hardly one makes room for an
-    object and brings it there. Asks the rollout for 10,000 pokes where H is 3 and J 64, CEM for 256 where H is 1.
+    """A first population for CEM, (J, H, 3), grown poke by poke: the first as `draw_pokes` gives it, every next one the
+    best of TRIES in the scene where those before led; a sequence after which the finger finds no room is dropped. And
+    `rest`, if it has H pokes.
+
+    Not in the paper: of sequences drawn at once hardly one makes room for an object and brings it there. It costs
+    10,000 pokes where H is 3 and J 64; all of CEM 256 where H is 1.
     """
     def longer(sequence):  # -> a list of one, or none where the finger then finds no room
         there = View(moved_scene(view, rollout(sequence[None])[0][:, -1]), view.marked)
@@ -295,16 +298,18 @@ def next_plan(policy, task, view, labels, goal, run, rng, search, rest=()):
 
 
 def choose_plan(ask, search, ahead, rest, lowest, left):
-    """The Plan to follow, of no more pokes than are left: as many as the rest of the last plan has; where that is not
-    enough, one of `search`; where that is not either, far from the goal, one of `ahead`; whichever gains most per poke.
+    """The Plan to follow: of those that are tried the one that gains most per poke. Not in the paper.
 
-    Not in the paper. Enough: it ends below the lowest cost yet by SLOW of it. ask: (search, rest) -> Plan, `next_plan`.
+    Tried in turn, until one is enough: as many pokes as `rest`, what the last plan has left; as many as `search` says;
+    and, unless the goal is near, `ahead`; none longer than `left`, the budget. Enough: it ends below `lowest`, the
+    lowest cost yet, by SLOW of it. ask: (search, rest) -> Plan, `next_plan`. Raises NoPoke where none finds any.
     """
     plans = []
     for horizon in dict.fromkeys(min(pokes, left) for pokes in (len(rest), search.horizon, ahead)):
         last = plans[-1] if plans else None
         enough = last and not last.cost > (1 - SLOW) * min(lowest, last.now)  # where there are no costs, any is
-        if not horizon or enough or last and horizon > search.horizon and last.now <= NEAR:
+        near = last and last.now <= NEAR
+        if not horizon or enough or near and horizon > search.horizon:
             continue
         try:
             plans.append(ask(replace(search, horizon=horizon), rest))
@@ -355,8 +360,8 @@ def closed_loop(task, run, policy, search, budget=10, seed=0, ahead=AHEAD):
     """Observe, plan, poke, until no poke is predicted to help or the budget is spent -> a dict.
 
     policy: one of POLICIES. run: the checkpoint; it also says where marked points went, whatever the policy. ahead:
-    pokes that are planned in a row where one hardly helps, as `choose_plan` says; where a mark shall stay it is no more
-    than `search` says, for it was pushed as often.
+    how many pokes to plan in a row where one hardly helps, see `choose_plan`; where a mark shall stay, `search.horizon`
+    instead, for to look further took 20 s and moved what stays as often.
     stopped: why it ended, a sentence. Of T pokes: rgb (T+1, H, W, 3), poses (T+1, 7, 7), marks (T+1, M, 3) m as
     followed, distance (T+1, M) m, angle (T+1, M) rad; pokes (T, 3), starts (T, 2) m, NaN where the finger found no
     room; and of the task movers, goal_marks, goal_rgb. Raises ValueError for a camera that cannot show the run its

@@ -467,8 +467,8 @@ def save_film(path, frames, seconds):
         first.save(temporary, save_all=True, append_images=others, duration=round(1000 * seconds), loop=0)
 
 
-STYLES = {"learned": ("learned model, mean", PREDICTED, "-"),
-          "oracle": ("the simulator as the model, one poke ahead", GREEN, "--"),
+STYLES = {"learned": ("learned model, up to three pokes ahead", PREDICTED, "-"),
+          "oracle": ("the simulator as the model, one ahead", GREEN, "--"),
           "random": ("random pokes", PINK, ":"), "no_motion": ("model of no motion", "0.4", "-.")}
 
 
@@ -476,7 +476,7 @@ def control_figure(curves, pokes):
     """Distance to the goals against the number of pokes: boxes over the scenes, a panel per number of objects to move.
 
     Paper: Sec. IV-G, its box plot. curves: {(planner, objects): (scenes, pokes + 1) m}; "learned" is drawn as boxes,
-    its mean and those of all other planners as lines.
+    its mean and those of the other planners of STYLES as lines.
     """
     numbers = sorted({objects for _, objects in curves})
     figure = Figure(figsize=(11, 3.8), dpi=100, layout="constrained")
@@ -494,7 +494,8 @@ def control_figure(curves, pokes):
         axes.grid(alpha=0.3, axis="y")
     figure.axes[0].set_ylabel("mean distance to the goals [cm]")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES))
-    figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes)", fontsize=12)
+    figure.suptitle("Planned pokes bring the objects to their goals (boxes: quartiles over the scenes, lines: means)",
+                    fontsize=12)
     return figure
 
 
