@@ -176,7 +176,7 @@ PLANTED = (
          "            arena.bullet.restoreState(start)\n            found", "            found")]),
     ("lab/tables.py", "tables", [
         ("tested on the training pokes", '_data(out / "test")), depth_noise', '_data(out / "train")), depth_noise'),
-        ("all tries identical", "seed=[seed, attempt]", "seed=seed"),
+        ("all tries identical", "[seed, attempt], ahead", "seed, ahead"),
         ("the best distance so far", "np.pad(distance,", "np.pad(np.minimum.accumulate(distance),"),
         ("the obstacle's shift measured on the mover", 'np.delete(record["poses"][..., :2], record["movers"], axis=1)',
          'record["poses"][:, record["movers"], :2]')]),
