@@ -87,15 +87,6 @@ def test_cells_are_kept_and_restored(tmp_path):
     assert json.loads(kept.read_text())["2d_noisy-2"] == again
 
 
-def test_tables_are_made_of_what_is_kept_of_every_seed(tmp_path):
-    cells = {name: cell_of_today(name, metrics={"flow_mse_ratio": ratio, "flow_mse_cm2": 10 * ratio})
-             for name, ratio in (("2d_clean-1", 0.1), ("2d_clean-2", 0.2), ("2d_clean-3", 0.3), ("3d_clean-1", 0.1))}
-    write_json(tmp_path / "kept.json", cells)
-    said = results.tables_so_far(tmp_path / "kept.json")
-    assert "| 2D loss | 0.148 | 0.200 \u00b1 0.100 |" in said and "3D loss |" not in said
-    assert results.tables_so_far(tmp_path / "none.json") == "None yet."
-
-
 @pytest.mark.parametrize("name, changes", [
     ("full_clean-1", {"data": None}), ("full_clean-1", {"format": "of before"}), ("full_clean-9", {}),
     ("full_clean-1", {"data": {**cell_of_today("full_clean-1")["data"], "test": [101, {"finger_force": 25.0}]}})])
